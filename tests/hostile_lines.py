@@ -281,6 +281,8 @@ def words(program: Program, random: Random) -> Iterator[Case]:
             wrong = ("",)
         for word in wrong:
             yield _with(program, f"{flag} {_named(word)!r}", flag, *[word] * count)
+        if action.type in WORDS and not flag.endswith("-seed") and flag != "--seed":
+            yield _with(program, f"{flag} a billion", flag, *[f"1{'0' * 9}"] * count)
         if action.nargs != "?":
             yield _with(program, f"{flag} alone", flag)
 

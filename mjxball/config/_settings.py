@@ -164,7 +164,7 @@ class ScenarioRanges:
     start_position: float = setting(0.0, "each coordinate of the start is drawn from +- this [m]", low=0, high=1e4)
     start_velocity: float = setting(0.0, "each start velocity is drawn from +- this [m/s]", low=0, high=100)
     start_tilt: float = setting(0.0, "start roll and pitch are drawn from +- this [rad]", low=0, high=1)
-    cg_speed: Range = drawn((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, high=1000)
+    cg_speed: Range = drawn((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, high=100)
     cg_amplitude: Range = drawn((0.05, 0.05), "amplitude of the CG's sine [m]", low=0, high=1e4)
     object_mass: Range = drawn((0.2, 0.2), "true mass of the object [kg]", low=1e-12, high=1e5)
     trim_margin: float = setting(

@@ -34,6 +34,12 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasse
             yield path, value, item
 
 
+def range_of(path: str) -> tuple[float, float]:
+    """Both ends of the range in which the numbers of the setting `path` must lie."""
+    item = next(item for known, _, item in leaves(Config()) if known == path)
+    return item.metadata["low"], item.metadata["high"]
+
+
 def to_text(value: Any) -> str:
     """The value of a leaf as the command line takes it."""
     if isinstance(value, tuple):
