@@ -22,22 +22,23 @@ MOST_DIGITS = 20  # of a whole number, which 64 bits hold; Python would take tho
 def parse_json(text: str | bytes) -> Any:
     """The value of a JSON text. Raises ValueError, also if an object has one key twice; RecursionError if too deep.
 
-    The standard leaves open which of both counts; Python would take the last one without a word.
+    The standard leaves open which of both counts; Python would take the last one without a word. A whole number that
+    64 bits do not hold is inf, as Python makes of 1e400: whoever checks a number says which one it is.
     """
     return json.loads(text, object_pairs_hook=_once, parse_int=_whole)
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The values of a TOML text. Raises ValueError; RecursionError if too deep."""
-    values = tomllib.loads(text)
-    rest: list[Any] = [values]
-    while rest:
-        one = rest.pop()
-        if isinstance(one, (dict, list)):
-            rest += one.values() if isinstance(one, dict) else one
-        elif isinstance(one, int) and abs(one) >= 10**MOST_DIGITS:
-            _whole(str(one))
-    return values
+    """The values of a TOML text, whole numbers as `parse_json` has them. Raises ValueError; RecursionError."""
+    return {name: _bounded(value) for name, value in tomllib.loads(text).items()}
+
+
+def _bounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _bounded(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_bounded(one) for one in value]
+    return _whole(str(value)) if type(value) is int else value
 
 
 def is_number(value: Any, most: float = LARGEST) -> TypeGuard[float]:
@@ -53,10 +54,10 @@ def shown(value: Any) -> str:
     return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}..."
 
 
-def _whole(digits: str) -> int:
-    if len(digits) > MOST_DIGITS:
-        raise ValueError(f"a whole number has {len(digits)} digits, more than {MOST_DIGITS}")
-    return int(digits)
+def _whole(digits: str) -> float:
+    if len(digits) <= MOST_DIGITS:
+        return int(digits)
+    return -math.inf if digits[0] == "-" else math.inf
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -112,10 +112,10 @@ REFUSED = {
     ),
     "misspelt key": (RING.replace("carrier_mass", "carier_mass"), "setting (did you mean plant.carrier_mass?)"),
     "unknown table": ("[wings]\n" + RING, "not wings"),
-    "mass beyond all floats": (RING + f"mass = 1{'0' * 400}", "a whole number has 401 digits"),
+    "mass beyond all floats": (RING + f"mass = 1{'0' * 400}", "not inf"),
     "object_mass beyond all floats": (
         RING.replace("[plant]", f"[plant]\ngravity = 1{'0' * 400}", 1),
-        "a whole number has 401 digits",
+        "not inf",
     ),
     "unknown key of a drone": (RING + "weight = 1.0", "unknown weight"),
     "drones in one place": (RING.replace("[-0.1, -0.17, 0.0]", "[-0.1, 0.17, 0.0]"), "the same place"),
