@@ -36,6 +36,20 @@ def text(content: bytes) -> bytes:
     return struct.pack("<I", len(content)) + content
 
 
+def laughs(name: str) -> bytes:
+    """A map of MCAP of one text: YAML of 9^39 words."""
+    lines = [f"- &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}" for k in range(1, 40)]
+    return text(name.encode()) + text("\n".join(["- &a0 {x: 1}", *lines]).encode())
+
+
+def channel(metadata: bytes, definition: bytes) -> bytes:
+    """An MCAP file of one channel and a message."""
+    schema = struct.pack("<H", 1) + text(b"a/msg/B") + text(b"ros2msg") + text(definition)
+    topic = struct.pack("<HH", 1, 1) + text(b"/a") + text(b"cdr") + text(metadata)
+    inside = record(0x03, schema) + record(0x04, topic) + record(0x05, struct.pack("<HIQQ", 1, 0, 1, 1) + bytes(12))
+    return mcap(b"", inside, len(inside))
+
+
 def mcap(compression: bytes, data: bytes, size: int, footer: bool = True) -> bytes:
     """An MCAP file of one chunk that says that it unpacks to `size` bytes."""
     magic = b"\x89MCAP0\r\n"
@@ -73,8 +87,7 @@ def folder(path: Path) -> None:
     """A bag's folder whose file was compressed, with YAML of 9^39 words."""
     path.mkdir()
     (path / "bag.db3.zstd").write_bytes(zstd_bomb(16))
-    laughs = "\n".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 40))
-    (path / "metadata.yaml").write_text(f"a0: &a0 x\n{laughs}\n")
+    (path / "metadata.yaml").write_bytes(laughs("x"))
 
 
 def cfclient(content: bytes) -> Callable[[Path], None]:
@@ -93,6 +106,8 @@ BOMBS: dict[str, Callable[[Path], object]] = {
     "cut.mcap": lambda path: path.write_bytes(mcap(b"zstd", zstd_bomb(), 64 * ZEROS, footer=False)),
     "lz4.mcap": lambda path: path.write_bytes(mcap(b"lz4", lz4_bomb(), ZEROS)),
     "long.mcap": lambda path: path.write_bytes(mcap(b"", b"", 0)[:-37] + struct.pack("<BQ", 5, 2**32) + bytes(60)),
+    "laughs.mcap": lambda path: path.write_bytes(channel(laughs("offered_qos_profiles"), b"float64 x")),
+    "defined.mcap": lambda path: path.write_bytes(channel(b"", b"float64 x\n" * 300_000)),
     "endless.db3": lambda path: database(path, ENDLESS),
     "computed.db3": lambda path: database(path, COMPUTED),
     "message.db3": lambda path: database(path, STORED.format(""), zstd_bomb()),

@@ -15,6 +15,7 @@ from mjxball.errors import InputError
 TIMES, ALWAYS, DISK = 100, 16 * 2**20, 2**32  # of a bag's own size; [bytes] whatever its size; [bytes] of copies
 PACKED = b"\x28\xb5\x2f\xfd"  # with which what zstd compressed begins
 PIECE = 2**20  # [bytes] unpacked at once
+DEFINED = 2**20  # letters of the definitions of a bag's messages, of which the parser reads some 50 000 a second
 
 Unpack = Callable[[bytes], bytes]
 
@@ -24,7 +25,7 @@ class Unpacking:
 
     def __init__(self, path: Path, size: int):
         self._path, self._limit = path, max(ALWAYS, TIMES * size)
-        self._left, self._copied = self._limit, 0
+        self._left, self._copied, self._defined = self._limit, 0, 0
 
     def refuse(self) -> None:
         """Raise InputError if it was too much, as whatever unpacks does at once."""
@@ -82,15 +83,38 @@ class Unpacking:
 
     @contextlib.contextmanager
     def bounding(self) -> Iterator[None]:
-        """Chunks that rosbags unpacks are counted meanwhile; it has no bound of its own, nor a way to be told one."""
-        from rosbags.rosbag2 import storage_mcap
+        """What rosbags unpacks and parses is counted meanwhile; it has no bounds of its own, nor a way to be told any.
 
-        kept = storage_mcap.DECOMPRESSORS
-        storage_mcap.DECOMPRESSORS = {name: _sized(unpack) for name, unpack in self._by_name().items()}
-        try:
+        What a bag says of the quality of its connections is YAML that may grow without end, and is of no use here.
+        """
+        from rosbags.highlevel import anyreader
+        from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+
+        chunks = {name: _sized(unpack) for name, unpack in self._by_name().items()}
+        ours: list[tuple[Any, str, Any]] = [(storage_mcap, "DECOMPRESSORS", chunks)]
+        ours += [(module, "parse_qos", lambda _: []) for module in (storage_mcap, storage_sqlite3)]
+        ours += [
+            (anyreader, name, self._defining(getattr(anyreader, name)))
+            for name in ("get_types_from_msg", "get_types_from_idl")
+        ]
+        with contextlib.ExitStack() as stack:
+            for module, name, value in ours:
+                stack.callback(setattr, module, name, getattr(module, name))
+                setattr(module, name, value)
             yield
-        finally:
-            storage_mcap.DECOMPRESSORS = kept
+
+    def _defining(self, parse: Callable[..., Any]) -> Callable[..., Any]:
+        """`parse` of the definitions of messages, of which all together may have `DEFINED` letters."""
+
+        def counted(text: str, *given: Any) -> Any:
+            self._defined += len(text)
+            if self._defined > DEFINED:
+                raise InputError(
+                    f"bag {self._path} defines its messages in more than {DEFINED >> 20} MiB; expected those of ROS 2"
+                )
+            return parse(text, *given)
+
+        return counted
 
     def _by_name(self) -> dict[str, Unpack]:
         """What unpacks a chunk, by the name of its compression."""
