@@ -32,7 +32,7 @@ class Sac:
     state_value: bool = setting(
         False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"
     )
-    learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", low=1e-8, high=1)
+    learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", low=1e-12, high=1)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     n_step: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
     tau: float = setting(0.02, "rate of the slow copies that give the targets", low=1e-6, high=1)
@@ -55,7 +55,7 @@ class Ppo:
     unroll_length: int = setting(20, "steps in a row whose advantages are estimated together", low=1, high=100_000)
     minibatches: int = setting(8, "parts of the unrolls that each pass over them is cut into", low=1, high=100_000)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1, high=100_000)
-    learning_rate: float = setting(2e-3, "Adam's rate at the start", low=1e-8, high=1)
+    learning_rate: float = setting(2e-3, "Adam's rate at the start", low=1e-12, high=1)
     discount: float = setting(0.97, "gamma", low=0, high=0.99999)
     entropy_cost: float = setting(0.0, "weight of the policy's entropy", low=0, high=100)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
@@ -77,7 +77,7 @@ class Gradient:
         high=100_000,
     )
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1, high=100_000)
-    learning_rate: float = setting(2e-2, "Adam's rate at the start", low=1e-8, high=1)
+    learning_rate: float = setting(2e-2, "Adam's rate at the start", low=1e-12, high=1)
     learning_rate_final_ratio: float = setting(
         0.02, "rate at the end of the run over the rate at its start", low=1e-6, high=1
     )
