@@ -1,6 +1,6 @@
 """The live view for Foxglove: what is added to a flight log, as messages of ROS 2 on a WebSocket of this machine.
 
-The protocol is Foxglove's `foxglove.sdk.v1`. A WebSocket of this machine can be opened by every page that its browser
+The protocol is version 1 of Foxglove's SDK. A WebSocket of this machine can be opened by every page that its browser
 shows, wherever it is from, so that the origin decides who is answered; Foxglove's own server does not look at it.
 """
 
