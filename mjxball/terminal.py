@@ -16,6 +16,7 @@ from typing import Any, TextIO
 
 PERIOD = 0.5  # [s] between two redraws
 GAP = "  "  # between the parts of a line
+LONGEST = 900  # characters of a sentence about a mistake
 Lines = Sequence[Sequence[str]]  # each of parts, the most important first
 
 
@@ -78,6 +79,12 @@ def warn(text: str) -> None:
     """The same on stderr."""
     if sys.stderr:
         print(fitted_to(sys.stderr, text), file=sys.stderr, flush=True)  # noqa: T201
+
+
+def sentence(text: str) -> str:
+    """`text` about a mistake in one line that a person can read."""
+    line = " ".join(text.splitlines())
+    return line if len(line) <= LONGEST else f"{line[:LONGEST]} ..."
 
 
 class Status:
