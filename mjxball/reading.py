@@ -1,4 +1,7 @@
-"""What files of others must be: JSON that says everything once, and time that runs forward. Standard library only."""
+"""What files of others must be: JSON that says everything once, numbers to compute with, time that runs forward.
+
+Standard library only.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,55 @@ import itertools
 import json
 import math
 import statistics
+import tomllib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
 GAP = 5.0  # steps from which on a recording has a hole
+LARGEST, SMALLEST = 1e12, 1e-30  # sizes of a number that is not 0: products of others are endless or 0 in float32
+MOST_DIGITS = 20  # of a whole number, which 64 bits hold; Python would take thousands, and no float does
 
 
 def parse_json(text: str | bytes) -> Any:
     """The value of a JSON text. Raises ValueError, also if an object has one key twice; RecursionError if too deep.
 
-    The standard leaves open which of both counts; Python would take the last one without a word.
+    The standard leaves open which of both counts; Python would take the last one without a word. A whole number that
+    64 bits do not hold is inf, as Python makes of 1e400: whoever checks a number says which one it is.
     """
-    return json.loads(text, object_pairs_hook=_once)
+    return json.loads(text, object_pairs_hook=_once, parse_int=_whole)
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The values of a TOML text, whole numbers as `parse_json` has them. Raises ValueError; RecursionError."""
+    return {name: _bounded(value) for name, value in tomllib.loads(text).items()}
+
+
+def _bounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _bounded(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_bounded(one) for one in value]
+    return _whole(str(value)) if type(value) is int else value
+
+
+def is_number(value: Any, most: float = LARGEST) -> TypeGuard[float]:
+    """Whether `value` is a number that can be computed with: no truth value, 0 or from `SMALLEST` to `most` in size."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return value == 0 or SMALLEST <= abs(value) <= most
+
+
+def shown(value: Any) -> str:
+    """`value` of a file or a command line as a sentence shows it."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}..."
+
+
+def _whole(digits: str) -> float:
+    if len(digits) <= MOST_DIGITS:
+        return int(digits)
+    return -math.inf if digits[0] == "-" else math.inf
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from typing import Any, TextIO
 
 PERIOD = 0.5  # [s] between two redraws
 GAP = "  "  # between the parts of a line
+LONGEST = 900  # characters of a sentence about a mistake
 Lines = Sequence[Sequence[str]]  # each of parts, the most important first
 
 
@@ -84,6 +85,12 @@ def _print(text: str, stream: TextIO | None) -> None:
     if stream:
         stream.write(f"{fitted_to(stream, text)}\n")
         stream.flush()
+
+
+def sentence(text: str) -> str:
+    """`text` about a mistake in one line that a person can read."""
+    line = " ".join(text.splitlines())
+    return line if len(line) <= LONGEST else f"{line[:LONGEST]} ..."
 
 
 class Status:

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from command_line import REPOSITORY as ROOT
+from recording_bombs import BOMBS
 
 from mjxball import cli, export
 from mjxball import config as configs
@@ -74,6 +75,9 @@ def _edited(field: str, value: Any) -> bytes:
     return _changed(lambda text: json.dumps({**json.loads(text), field: value}))
 
 
+CARD_NUMBERS = {"gravity": 0, "control_period": 0, "action_reach": 2, "leader_kp": 3, "training_steps": 0}
+
+
 def policies() -> dict[str, Content]:
     """Damaged policy files."""
     sound = shipped_policy("balance").read_bytes()
@@ -88,6 +92,14 @@ def policies() -> dict[str, Content]:
         "a twice given key": _changed(lambda text: '{"gravity": 1.62, ' + text[1:]),
         "flown by one drone": _edited("flown", {"drones": [1], "seconds": 60}),
         "a card of 100 000 brackets": _changed(lambda text: "[" * 100_000),
+        **{
+            f"{field} {told}": _edited(field, [number] * count if count else number)
+            for field, count in CARD_NUMBERS.items()
+            for told, number in (("of 401 digits", 10**400), ("1e-320", 1e-320), ("1e300", 1e300))
+        },
+        "flown for 1e-320 s": _edited("flown", {"drones": [2], "seconds": 1e-320}),
+        "a bound of 10^400": _edited("bounds", {"rmse": 10**400}),
+        "10^400 observations": _edited("history", 10**400),
     }
 
 
@@ -113,10 +125,15 @@ def rigs() -> dict[str, tuple[str, Content]]:
         "drones in one place": RIG.replace("-0.09815, -0.17", "-0.09815, 0.17"),
         "drones that are a number": RIG.split("# The leader")[0].replace("[plant]", "[plant]\ndrones = 3"),
     }
+    for told, number in (("of 401 digits", 10**400), ("1e-320", "1e-320"), ("5e-324", "5e-324"), ("1e300", "1e300")):
+        for name in ("object_mass", "gravity", "arm"):
+            toml[f"{name} {told}"] = f"[plant]\n{name} = {number}\n"
     text = json.dumps({"plant": {"object_mass": 0.3}})
     other = {
         "JSON: a key given twice": '{"plant": {"object_mass": 0.3, "object_mass": 0.4}}',
         "JSON: NaN": '{"plant": {"object_mass": NaN}}',
+        "JSON: a mass of 401 digits": text.replace("0.3", str(10**400)),
+        "JSON: a mass of 1e-320": text.replace("0.3", "1e-320"),
         "JSON: 1e400": text.replace("0.3", "1e400"),
         "JSON: a list": "[1, 2]",
         "JSON: brackets": '{"plant":' * 50_000,
@@ -161,6 +178,9 @@ def sweeps() -> dict[str, Content]:
         "NaN": '{"sac.learning_rate": [NaN, 1e-3]}',
         "words": '{"sac.learning_rate": ["a", "b"]}',
         "a list": "[1, 2]",
+        "a rate of 1e-320": '{"sac.learning_rate": [1e-320, 1e-3]}',
+        "a rate of 401 digits": f'{{"sac.learning_rate": [{10**400}, 1e-3]}}',
+        "a rate of a billion": '{"sac.learning_rate": [1e9, 1e-3]}',
     }
     return {flaw: text.encode() for flaw, text in rows.items()}
 
@@ -228,7 +248,16 @@ def programs() -> list[Program]:
     ]
 
 
-WORDS: dict[Any, tuple[str, ...]] = {float: ("nan", "inf", "1e999", "abc", ""), int: ("abc", "1.5", "1e30", "nan", "")}
+WORDS: dict[Any, tuple[str, ...]] = {
+    float: ("nan", "inf", "1e999", "abc", "", "1e-320", "1e300", "9" * 400),
+    int: ("abc", "1.5", "1e30", "nan", "", "9" * 400, "9" * 5000),
+}
+
+
+def _named(word: str) -> str:
+    return word if len(word) < 20 else f"{len(word)} digits"
+
+
 OUTPUTS = ("--out", "--json", "--log", "--save")
 
 
@@ -247,11 +276,13 @@ def words(program: Program, random: Random) -> Iterator[Case]:
         if action.choices is not None:
             wrong = ("", "nonsense")
         elif action.type in WORDS:
-            wrong = tuple(random.sample(WORDS[action.type], 2))
+            wrong = tuple(random.sample(WORDS[action.type], 3))
         else:
             wrong = ("",)
         for word in wrong:
-            yield _with(program, f"{flag} {word!r}", flag, *[word] * count)
+            yield _with(program, f"{flag} {_named(word)!r}", flag, *[word] * count)
+        if action.type in WORDS and not flag.endswith("-seed") and flag != "--seed":
+            yield _with(program, f"{flag} a billion", flag, *[f"1{'0' * 9}"] * count)
         if action.nargs != "?":
             yield _with(program, f"{flag} alone", flag)
 
@@ -260,8 +291,22 @@ def settings(program: Program, random: Random, count: int) -> Iterator[Case]:
     """Some of the configuration's flags with what no setting is."""
     leaves = random.sample([path for path, _, _ in configs.leaves(configs.Config())], count)
     for number, path in enumerate(leaves):
-        word = ("nan", "1e999", "-1e30", "abc", "1,2,3,4,5,6,7,8,9")[number % 5]
-        yield _with(program, f"--{path}={word}", f"--{path}={word}")
+        word = ("nan", "1e999", "-1e30", "abc", "1,2,3,4,5,6,7,8,9", "1e-320", "1e9", "1e300", "9" * 400)[number % 9]
+        yield _with(program, f"--{path}={_named(word)}", f"--{path}={word}")
+    for flag in (
+        "sac.learning_rate=1e-320",
+        "scenario.noise=0,1e9",
+        "scenario.cg_speed=0,1e9",
+        "sac.num_envs=10000000",
+    ):
+        yield _with(program, f"--{flag}, a range", f"--{flag}")
+    meet = ("--distributed", "--coordinator", "localhost:1", "--process", "0", "--processes")
+    for flaw, line in {
+        "a billion processes": (*meet, "1000000000"),
+        "no process": (*meet, "0"),
+        "nobody's port": ("--distributed", "--coordinator", "localhost:99999", "--process", "0", "--processes", "2"),
+    }.items():
+        yield _with(program, flaw, *line)
 
 
 def _with(program: Program, flaw: str, *flag: str, files: dict[str, Content] | None = None) -> Case:
@@ -305,7 +350,24 @@ def files(every: dict[str, Program]) -> Iterator[Case]:
         yield _with(every["train"], f"--sweep {flaw}", "--sweep", "sweep.json", files={"sweep.json": content})
     for flaw, content in ODD_FILES.items():
         yield _with(every["fly"], f"--gains {flaw}", "--gains", "own.json", files={"own.json": content})
+    yield from numbers(every)
     yield from outputs(every)
+
+
+def numbers(every: dict[str, Program]) -> Iterator[Case]:
+    """What says that it is larger than any computer, and plants of such numbers where others read them."""
+    for flaw, make in BOMBS.items():
+        for name, line in {
+            "eval": ("--flight", flaw, "--out", "out"),
+            "view": (flaw, "--out", "page.html"),
+            "identify": (flaw, "--out", "plant.json"),
+            "export": (flaw, "out.csv"),
+        }.items():
+            yield Case(name, f"recording: {flaw}", (*every[name].start, *line), {flaw: make})
+    for flaw, (file, content) in rigs().items():
+        if flaw.split()[0] in ("object_mass", "gravity", "arm", "JSON:"):
+            yield _with(every["design"], f"--plant {flaw}", "--plant", file, files={file: content})
+            yield _with(every["gains"], f"--plant {flaw}", "--plant", file, files={file: content})
 
 
 def outputs(every: dict[str, Program]) -> Iterator[Case]:
@@ -328,7 +390,7 @@ def _full(path: Path) -> None:
     (path / "mine").write_text("mine")
 
 
-def every_case(seed: int = 0, config_flags: int = 40) -> list[Case]:
+def every_case(seed: int = 0, config_flags: int = 90) -> list[Case]:
     """All of them, in a fixed order."""
     random, named = Random(seed), {program.name: program for program in programs()}
     found: list[Case] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate.scenarios import read_waveform
 from mjxball.fly.preflight import read_gains
 from mjxball.policy.file import load_file, shipped_policy
-from mjxball.reading import check_times, parse_json
+from mjxball.reading import check_times, is_number, parse_json, parse_toml
 from mjxball.train.curves import training_curve
 from mjxball.train.progress import COMMON, Progress
 from mjxball.train.run_directory import read_config, read_rows, read_sweep, write_config
@@ -158,3 +159,19 @@ def test_rows_of_a_run_that_do_not_follow_are_left_out_and_told(
     progress.close()
     assert progress.before == 2.0
     assert [line.split(",")[0] for line in path.read_text().splitlines()] == ["steps", "100", "200"]
+
+
+def test_numbers_that_64_bits_do_not_hold_are_endless() -> None:
+    """As 1e400 is: whoever checks a number then says which one it is."""
+    for digits, number in (("1" + "0" * 400, math.inf), ("-1" + "0" * 400, -math.inf), (str(2**63), 2**63), ("7", 7)):
+        for found in (parse_json(f'{{"a": [{digits}]}}'), parse_toml(f"a = [{digits}]")):
+            assert found == {"a": [number]}
+            assert type(found["a"][0]) is type(number)
+
+
+def test_numbers_that_can_be_computed_with() -> None:
+    sound = (0, 0.0, -1, 1e-30, -1e12, 10**12)
+    assert all(map(is_number, sound))
+    for odd in (True, None, "1", [1], math.nan, math.inf, 1e-31, -1e-320, 5e-324, 1.1e12, 10**400):
+        assert not is_number(odd), odd
+    assert not is_number(2.0, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from docutils import nodes
@@ -15,14 +16,15 @@ def row(*cells: list[nodes.Node]) -> nodes.row:
     return nodes.row("", *(nodes.entry("", *(nodes.paragraph("", "", part) for part in cell)) for cell in cells))
 
 
-def setting(path: str, value: Any, about: str) -> nodes.row:
+def setting(path: str, value: Any, bounds: Mapping[str, Any]) -> nodes.row:
     """The line of one setting."""
-    default = nodes.inline("", f"default {to_text(value) or '(none)'}", classes=["default"])
-    return row([nodes.literal("", f"--{path}"), default], [nodes.Text(about)])
+    span = "" if bounds["low"] is None else f"; {bounds['low']:g} to {bounds['high']:g}"
+    default = nodes.inline("", f"default {to_text(value) or '(none)'}{span}", classes=["default"])
+    return row([nodes.literal("", f"--{path}"), default], [nodes.Text(bounds["about"])])
 
 
 class Settings(SphinxDirective):
-    """`settings` with the part's name: a table of flag, default and meaning."""
+    """`settings` with the part's name: a table of flag, default, range and meaning."""
 
     required_arguments = 1
 
@@ -30,7 +32,7 @@ class Settings(SphinxDirective):
         """Build the table."""
         part = self.arguments[0]
         found = [(path, value, item) for path, value, item in leaves(Config()) if path.startswith(f"{part}.")]
-        rows = [setting(path, value, item.metadata["about"]) for path, value, item in found]
+        rows = [setting(path, value, item.metadata) for path, value, item in found]
         if not rows:
             raise self.error(f"the configuration has no part called {part!r}")
         head = row(*([nodes.Text(text)] for text in ("flag", "meaning")))

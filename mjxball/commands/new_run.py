@@ -48,7 +48,7 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
-    extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
+    extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name) is not None}
     if extensions.get("algorithm") == "sac":  # the default, of which nothing is to be checked
         del extensions["algorithm"]
     physics = options.physics or "mjx"

@@ -15,6 +15,7 @@ from mjxball.config._plant import Drone
 from mjxball.config._renamed import CONSTANT, check_constant, current_name, with_current_names
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
+from mjxball.reading import shown
 
 MAX_LISTED = 6
 
@@ -31,6 +32,12 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasse
                 yield from leaves(record, f"{path}.{number}.")
         elif item.metadata:
             yield path, value, item
+
+
+def range_of(path: str) -> tuple[float, float]:
+    """Both ends of the range in which the numbers of the setting `path` must lie."""
+    item = next(item for known, _, item in leaves(Config()) if known == path)
+    return item.metadata["low"], item.metadata["high"]
 
 
 def to_text(value: Any) -> str:
@@ -115,7 +122,7 @@ def _parse(path: str, text: str, example: Any, kind: type) -> Any:
     except (ValueError, KeyError):
         several = f"comma-separated {'whole ' if kind is int else ''}numbers"
         wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: several}
-        raise InputError(f"--{path} takes {wanted[type(example)]}, not {text!r}") from None
+        raise InputError(f"--{path} takes {wanted[type(example)]}, not {shown(text)}") from None
 
 
 def _near(name: str, known: Iterable[str]) -> str:

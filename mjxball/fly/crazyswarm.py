@@ -21,6 +21,7 @@ from mjxball.fly.limits import NAMES
 from mjxball.fly.parameters import is_written
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.uri import check_pair, parse_uri
+from mjxball.reading import is_number
 
 LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
 MERGE = "tag:yaml.org,2002:merge"  # the key <<
@@ -235,6 +236,6 @@ def _number(value: Any, where: str) -> float:
         number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else math.nan
     except (ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number):
+    if not is_number(number):
         raise InputError(f"{where} must be a finite number, not {str(value)[:60]}")
     return number

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.config import Config, ball_limit, cg_limit
+from mjxball.config import Config, ball_limit, cg_limit, range_of
 from mjxball.errors import InputError
 from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
 
@@ -23,6 +23,7 @@ class CgPath:
     lead: float = 0.0  # phase of the second [rad]
 
 
+FASTEST, HEAVIEST = range_of("scenario.cg_speed")[1], range_of("scenario.object_mass")[1]
 CIRCLE = CgPath(width=1.0, lead=math.pi / 2)
 OF_PLANT: Any = None  # of a scenario's number: what the plant says, see `of_plant`
 AMPLITUDE, GOAL = 0.05, 1.0  # [m] of a plant that allows them
@@ -83,10 +84,12 @@ def check_scenario(config: Config, scenario: Scenario) -> Scenario:
         raise InputError("every number of a scenario must be finite")
     if scenario.mass <= 0:
         raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
-    if scenario.believed_mass is not None and scenario.believed_mass < 0:
-        raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
-    if scenario.omega < 0 or scenario.amplitude < 0:
-        raise InputError("omega and amplitude must not be negative")
+    if not 0 <= (scenario.believed_mass or 0) <= HEAVIEST:
+        raise InputError(f"believed mass must be between 0 and {HEAVIEST:g} kg, not {scenario.believed_mass:g}")
+    if not 0 <= scenario.omega <= FASTEST:
+        raise InputError(f"omega must be between 0 and {FASTEST:g} rad/s, not {scenario.omega:g}")
+    if scenario.amplitude < 0:
+        raise InputError(f"amplitude must not be negative, but is {scenario.amplitude:g} m")
     left = scenario.mass + np.cumsum([mass for _, mass in sorted(scenario.mass_changes)])
     if (left <= 0).any():
         raise InputError(f"the mass changes would leave {left.min():.3g} kg of object; it must stay positive")

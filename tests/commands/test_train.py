@@ -238,6 +238,11 @@ BAD_ARGUMENTS = {
     "not a switch": ["--sac.alpha_fixed", "maybe"],
     "seed too large": ["--seed", 2**40],
     "seed is a word": ["--seed", "lucky"],
+    "a rate that float32 does not hold": ["--sac.learning_rate", "1e-320"],
+    "noise of a billion deviations": ["--scenario.noise", "0,1e9"],
+    "a load that moves at 1e9 rad/s": ["--scenario.cg_speed", "0,1e9"],
+    "a seed of 400 digits": ["--seed", "9" * 400],
+    "a billion processes": ["--distributed", "--coordinator", "h:1", "--processes", 10**9, "--process", 0],
 }
 
 

@@ -105,7 +105,7 @@ def test_spline_passes_its_samples_and_stands_still_outside() -> None:
     ("times", "offsets", "word"),
     [
         ((0.0, 1.0), (0.0, 0.2), "leave the object"),
-        ((0.0, 1.0), (0.0, float("nan")), "finite"),
+        ((0.0, 1.0), (0.0, float("nan")), "between"),
         ((0.0, 2.0, 1.0), (0.0, 0.1, 0.0), "increase"),
         ((0.0, 1.0, 1.0), (0.0, 0.1, 0.0), "increase"),
         ((0.0, 1.0), (0.0,), "same number"),

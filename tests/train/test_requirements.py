@@ -26,17 +26,17 @@ from mjxball.xla import explained
 
 PHYSICS = ["--physics", "newton-euler"]
 TOO_MUCH: list[tuple[list[Any], str]] = [
-    (["--algorithm", "gradient", "--gradient.num_envs", 10**11], "at least .* GB|environment steps"),
+    (["--algorithm", "gradient", "--gradient.num_envs", 10**11], "at least .* GB|environment steps|must be between"),
     (["--algorithm", "gradient", "--gradient.num_envs", 10**6, "--gradient.gradient_steps", 1], "GB are free"),
-    (["--algorithm", "ppo", "--ppo.num_envs", 10**11, "--ppo.minibatches", 8], "at least"),
-    (["--sac.policy_layers", 10**11], "GB are free"),
-    (["--sac.critic_layers", "1000000,1000000"], "GB are free"),
-    (["--sac.replay_size", 128 * 10**9], "GB are free"),
-    (["--follower.recurrent_units", 10**8], "recurrent_units must be at most 512"),
+    (["--algorithm", "ppo", "--ppo.num_envs", 10**11, "--ppo.minibatches", 8], "between"),
+    (["--sac.policy_layers", "100000,100000"], "GB are free"),
+    (["--sac.critic_layers", "100000,100000"], "GB are free"),
+    (["--sac.replay_size", 128 * 10**7], "GB are free"),
+    (["--follower.recurrent_units", 10**8], "recurrent_units must be between 0 and 512"),
     (["--follower.recurrent_units", 512, "--num-seeds", 1024], "GB are free"),
     (["--num-seeds", 4096], "GB are free"),
     (["--sac.total_steps", 10**12], "environment steps"),
-    (["--sac.total_steps", 2 * 10**9, "--sac.num_envs", 1, "--sac.updates_per_step", 10**6], "years"),
+    (["--sac.total_steps", 2 * 10**9, "--sac.num_envs", 1, "--sac.updates_per_step", 10**5], "years|days"),
     (["--timing.control_period", "1e-30"], "control_period"),
     (["--timing.physics_steps", 10**9], "physics_steps"),
 ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import socket
 import struct
 from pathlib import Path
 from typing import Any
@@ -20,11 +22,16 @@ from mjxball.fly.limits import FlightSettings
 from mjxball.view.foxglove import Foxglove
 from mjxball.view.main import main as view
 
-pytest.importorskip("foxglove")
 client = pytest.importorskip("websockets.sync.client")
+exceptions = pytest.importorskip("websockets.exceptions")
 typesys = pytest.importorskip("rosbags.typesys")
 DATA = struct.Struct("<BIQ")  # kind of message, subscription, time [ns]. https://github.com/foxglove/ws-protocol
 PATIENCE = 20.0  # [s]
+SUBSCRIBE = '{{"op": "subscribe", "subscriptions": [{{"id": {}, "channelId": 1}}]}}'
+HANDSHAKE = (
+    "GET / HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+)
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +102,69 @@ def test_only_this_machine_is_served() -> None:
         listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
         listening += [line.split()[1] for line in Path("/proc/net/tcp6").read_text().splitlines()[1:]]
     assert [one for one in listening if one.endswith(f":{port:04X}")] == [f"0100007F:{port:04X}"]
+
+
+def test_pages_of_elsewhere_are_refused() -> None:
+    """By their origin, and by the name by which they reached this machine."""
+    asked: list[tuple[dict[str, Any], bool]] = [
+        ({}, True),
+        ({"origin": "https://app.foxglove.dev"}, True),
+        ({"origin": "http://localhost:8080"}, True),
+        ({"origin": "file://"}, True),
+        ({"origin": "http://evil.example"}, False),
+        ({"origin": "https://app.foxglove.dev.evil.example"}, False),
+        ({"origin": "http://app.foxglove.dev"}, False),
+        ({"origin": "http://localhost.evil.example"}, False),
+        ({"origin": "null"}, False),
+        ({"additional_headers": {"Origin": "file:///"}, "origin": "http://evil.example"}, False),
+    ]
+    with Foxglove(0) as server:
+        for headers, welcome in asked:
+            if welcome:
+                with client.connect(server.address, subprotocols=["foxglove.sdk.v1"], **headers) as plug:
+                    assert heard(plug, "serverInfo")["name"] == "mjxball", headers
+                continue
+            with pytest.raises(exceptions.InvalidStatus, match="403"):
+                client.connect(server.address, subprotocols=["foxglove.sdk.v1"], **headers)
+        port = int(server.address.rpartition(":")[2])
+        for name in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example"):
+            with socket.create_connection(("127.0.0.1", port)) as plug:
+                plug.sendall(HANDSHAKE.format(name).encode())
+                assert plug.recv(100).startswith(b"HTTP/1.1 403"), name
+
+
+def test_a_client_that_says_anything_else_is_let_go_of_and_the_others_stay() -> None:
+    with Foxglove(0) as server, client.connect(server.address, subprotocols=["foxglove.sdk.v1"]) as stays:
+        for text in ("nonsense", "[1]", "[" * 60_000, '{"op": "subscribe"}', SUBSCRIBE.format(2**40), "x" * 10**6):
+            with client.connect(server.address, subprotocols=["foxglove.sdk.v1"]) as plug:
+                plug.send(text)
+                with contextlib.suppress(exceptions.ConnectionClosed):
+                    while plug.recv(timeout=PATIENCE):
+                        pass
+        schema = server.register_schema("x/msg/Y", "ros2msg", b"float64 x")
+        channel = server.register_channel("/y", "cdr", schema)
+        stays.send(SUBSCRIBE.format(3))
+        stays.send('{"op": "unknown"}')
+        stays.ping().wait(PATIENCE)
+        server.add_message(channel, 5, b"12345678", 5, 0)
+        found: Any = ""
+        while isinstance(found, str):
+            found = stays.recv(timeout=PATIENCE)
+        assert found == DATA.pack(1, 3, 5) + b"12345678"
+
+
+def test_a_client_that_does_not_read_holds_nobody_up() -> None:
+    """What it misses is the oldest."""
+    with Foxglove(0) as server, client.connect(server.address, subprotocols=["foxglove.sdk.v1"]) as plug:
+        channel = server.register_channel("/y", "cdr", server.register_schema("x/msg/Y", "ros2msg", b"uint8[] x"))
+        plug.send(SUBSCRIBE.format(3))
+        plug.ping().wait(PATIENCE)
+        for number in range(3000):
+            server.add_message(channel, number, bytes(20_000), number, 0)
+        last = 0
+        while last < 2999:
+            found = plug.recv(timeout=PATIENCE)
+            last = DATA.unpack_from(found)[2] if isinstance(found, bytes) else last
 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
