@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import json
 import math
@@ -11,6 +12,7 @@ from typing import Any
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
 GAP = 5.0  # steps from which on a recording has a hole
+STRAY = 0.1  # share of rows whose time may not follow
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -37,6 +39,28 @@ def time_fault(before: float, after: float) -> str | None:
     if after < before:
         return f"the time goes back by {before - after:.3g} s"
     return "a time stands twice" if after == before else None
+
+
+def following(times: Sequence[float]) -> list[int]:
+    """Numbers of the most rows whose `times` [s] increase; the others' times are how some writers say "missing".
+
+    Raises ValueError with a phrase if more than a tenth are others: nothing says when the rest happened.
+    """
+    ends: list[float] = []  # of series of one row, of two, and so on, the earliest
+    rows: list[int] = []  # at these ends
+    before: list[int] = []  # each row's
+    for number, now in enumerate(times):
+        if math.isfinite(now):
+            place = bisect.bisect_left(ends, now)
+            ends[place : place + 1], rows[place : place + 1] = [now], [number]
+        before.append(rows[place - 1] if math.isfinite(now) and place else -1)
+    found, last = [], rows[-1] if rows else -1
+    while last >= 0:
+        found.append(last)
+        last = before[last]
+    if len(times) - len(found) > STRAY * len(times):
+        check_times(times)
+    return found[::-1]
 
 
 def check_times(times: Sequence[float], shortest: float = 0.0, longest: float = math.inf) -> list[str]:

@@ -14,8 +14,11 @@ from mjxball.errors import InputError, said
 from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, VARIABLES, WIDTHS, Series
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
-BAGS = (".mcap", ".db3")
-CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ
+BAGS, PACKED = (".mcap", ".db3"), ".zstd"
+CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ as a rule
+ASTRAY = 1  # [s] by which one of them may: a stamp of 0 says that the message is of no time
+COMPRESSED = b"\x28\xb5\x2f\xfd"  # first bytes of what zstd compressed, which no message in CDR begins with
+MOST_EXPANDED, MOST_MESSAGE = 2**30, 2**24  # bytes of what was compressed
 SHOWN = 6  # topics that a sentence names
 
 
@@ -36,7 +39,7 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
     from rosbags.typesys import Stores, get_typestore
 
     with tempfile.TemporaryDirectory() as spare:
-        files = [_whole(file, Path(spare), remark) for file in _files(path)]
+        files = [_whole(_expanded(file, Path(spare)), Path(spare), remark) for file in _files(path)]
         try:
             with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 return _contents(path, reader)
@@ -50,6 +53,11 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
             raise InputError(f"bag {path} cannot be read: {said(error)}") from None
 
 
+def is_bag(path: Path) -> bool:
+    """Whether `path` is called as a bag's file is, compressed or not."""
+    return path.name.removesuffix(PACKED).endswith(BAGS)
+
+
 def _files(path: Path) -> list[Path]:
     """The bag `path` itself, or the files of a folder that has no metadata, or one for files that are not whole."""
     if path.is_file():
@@ -57,12 +65,45 @@ def _files(path: Path) -> list[Path]:
     inside = [path, *path.iterdir()] if path.is_dir() else [path]
     if odd := [one for one in inside if one.exists() and not one.is_file() and not one.is_dir()]:
         raise InputError(f"bag {odd[0]} is no regular file")
-    found = sorted(one for one in path.iterdir() if one.suffix in BAGS and one.is_file()) if path.is_dir() else []
+    found = sorted(one for one in path.iterdir() if is_bag(one) and one.is_file()) if path.is_dir() else []
     if (path / "metadata.yaml").is_file() and all(one.suffix != ".mcap" or _ends(one) for one in found):
         return [path]
     if not found:
         what = "is a folder without metadata.yaml, .mcap or .db3" if path.exists() else "does not exist"
         raise InputError(f"bag {path} {what}; expected a rosbag2 file or folder, or cfclient's leader and follower")
+    return found
+
+
+def _expanded(path: Path, spare: Path) -> Path:
+    """`path`, or in the folder `spare` what was compressed into it. Raises InputError: that is too much."""
+    if path.is_dir() or path.suffix != PACKED:
+        return path
+    import zstandard
+
+    copy = spare / path.stem
+    with path.open("rb") as stream, copy.open("xb") as target:
+        try:
+            for chunk in zstandard.ZstdDecompressor().read_to_iter(stream):
+                target.write(chunk)
+                if target.tell() > MOST_EXPANDED:
+                    raise InputError(f"bag {path} holds more than {MOST_EXPANDED >> 30} GiB; expected a flight")
+        except zstandard.ZstdError as error:
+            raise InputError(f"bag {path} cannot be read: {error}") from None
+    return copy
+
+
+def _uncompressed(path: Path, message: bytes) -> bytes:
+    """`message`, which a recorder may have compressed by itself, and only metadata that are lost would say so."""
+    if bytes(message[: len(COMPRESSED)]) != COMPRESSED:
+        return message
+    import zstandard
+
+    with zstandard.ZstdDecompressor().stream_reader(message) as stream:
+        found = stream.read(MOST_MESSAGE + 1)
+    if len(found) > MOST_MESSAGE:
+        raise InputError(
+            f"bag {path} holds a message of more than {MOST_MESSAGE >> 20} MiB; expected those of a flight"
+        )
     return found
 
 
@@ -136,11 +177,12 @@ def _contents(path: Path, reader: Any) -> Found:
     for topic, received, drone, header, values in _parts(path, reader, wanted):
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
+        stamped = abs(received - now) <= ASTRAY * 10**9
         for quantity, numbers in values.items():
             _check_width(path, topic, quantity, len(numbers))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
-            times.append((now - reader.start_time) * 1e-9)
-            rows.append(numbers)
+            times.append(((now if stamped else received) - reader.start_time) * 1e-9)
+            rows.append(numbers if stamped else (np.nan,) * len(numbers))
     _check_clocks(path, apart)
     return Found(b"", _densest(found), has)
 
@@ -154,7 +196,7 @@ def _parts(path: Path, reader: Any, topics: set[str]) -> Iterator[tuple[str, int
     wanted = [one for one in reader.connections if one.topic in topics]
     for connection, received, raw in reader.messages(wanted) if wanted else ():
         topic = connection.topic
-        known, message = TOPICS[_last(topic)], reader.deserialize(raw, connection.msgtype)
+        known, message = TOPICS[_last(topic)], reader.deserialize(_uncompressed(path, raw), connection.msgtype)
         try:
             parts = list(known.take(message))
         except AttributeError as error:
