@@ -225,9 +225,14 @@ def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:
 
 
 def _densest(found: dict[tuple[str, str, str], tuple[list[float], list[Any]]]) -> Series:
-    """Of several topics for one quantity of a drone that with the most messages, in the order of time."""
+    """Of several topics for one quantity of a drone that with the most messages, in the order of time.
+
+    One of zeros, which nobody measured, comes last.
+    """
     series: Series = {}
-    for (drone, quantity, _), (times, rows) in sorted(found.items(), key=lambda item: len(item[1][0])):
+    for (drone, quantity, _), (times, rows) in sorted(
+        found.items(), key=lambda one: (np.any(one[1][1]), len(one[1][0]))
+    ):
         order, first = np.unique(np.array(times), return_index=True)
         series.setdefault(drone, {})[quantity] = order, np.array(rows, float)[first]
     return series

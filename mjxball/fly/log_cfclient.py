@@ -53,7 +53,7 @@ def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
                 if len(row) != len(head):
                     raise ValueError(f"row {number} has {len(row)} values; expected {len(head)}")
             table = np.array([[one or "nan" for one in row] for row in rows], float).reshape(-1, len(head))
-            kept = following(table[:, 0].tolist())
+            kept = following((1e-3 * table[:, 0]).tolist())
             if len(kept) < 2:
                 raise ValueError("it holds fewer than two rows")
             if lost := len(table) - len(kept):

@@ -38,18 +38,18 @@ def sound(path: Path, own: Drone, name: str, remark: Callable[[str], None]) -> D
     for quantity, (time, rows) in own.items():
         good = _sound_rows(quantity, time, rows)
         lost = len(time) - int(good.sum())
-        missing = f"{called(quantity)} of {name} is missing in {lost} of {len(time)} rows"
+        what = f"{called(quantity)} of {name}"
         if len(time) - lost < 2 or (quantity in USUAL and not rows[good].any()):
             if quantity in NEEDED:
-                raise InputError(f"{path}: {missing}; expected {EXPECTED[quantity]} in two or more")
+                has = f"{what} has {len(time) - lost} good rows of {len(time)}"
+                raise InputError(f"{path}: {has}; expected two or more, of {EXPECTED[quantity]}")
             continue  # as are those that nobody measured, which are zeros
         if lost:
-            remark(f"{missing}, first {time[~good][0] - time[0]:.2f} s after its beginning")
+            when = f"first {time[~good][0] - time[0]:.2f} s after its beginning"
+            remark(f"{what} is missing in {lost} of {len(time)} rows, {when}")
         found[quantity] = time[good], rows[good]
         if (span := float(np.ptp(time[good]))) > LONGEST:
-            raise InputError(
-                f"{path}: {called(quantity)} of {name} goes on for {span:.3g} s; expected {LONGEST:g} s or less"
-            )
+            raise InputError(f"{path}: {what} goes on for {span:.3g} s; expected {LONGEST:g} s or less")
     for quantity in USUAL.keys() & found.keys():
         found[quantity] = _in_axes(path, found, quantity, name, remark)
     return found
