@@ -50,10 +50,10 @@ def following(times: Sequence[float]) -> list[int]:
     rows: list[int] = []  # at these ends
     before: list[int] = []  # each row's
     for number, now in enumerate(times):
-        if math.isfinite(now):
-            place = bisect.bisect_left(ends, now)
+        place = bisect.bisect_left(ends, now) if math.isfinite(now) else 0
+        before.append(rows[place - 1] if place else -1)
+        if math.isfinite(now) and (place == len(ends) or now < ends[place]):
             ends[place : place + 1], rows[place : place + 1] = [now], [number]
-        before.append(rows[place - 1] if math.isfinite(now) and place else -1)
     found, last = [], rows[-1] if rows else -1
     while last >= 0:
         found.append(last)
