@@ -65,7 +65,7 @@ def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
         except ValueError as error:
             raise InputError(f"{file} cannot be used: {error}") from None
         return {name: (time, column[:, None]) for name, column in zip(head[1:], table.T[1:], strict=True)}
-    raise InputError(f"{file} is no text; expected cfclient's CSV")
+    raise InputError(f"{file} is no text in UTF-8; expected cfclient's CSV")
 
 
 def _joined(folder: Path, columns: dict[str, Samples]) -> dict[str, Samples]:

@@ -299,6 +299,19 @@ def test_cfclient_s_rows_out_of_time(tmp_path: Path) -> None:
             np.testing.assert_allclose(row, whole[time], atol=1e-4)
 
 
+def test_texts_with_a_byte_order_mark_and_other_line_ends(tmp_path: Path) -> None:
+    records = swaying(60)
+    paths = [WRITERS[source](tmp_path / source, records) for source in ("cfclient", "MCAP")]
+    texts = [*paths[0].rglob("*.csv"), paths[1] / "metadata.yaml"]
+    whole = [states_of(path, []) for path in paths]
+    for text in texts:
+        text.write_bytes(b"\xef\xbb\xbf" + text.read_bytes().replace(b"\n", b"\r\n"))
+    np.testing.assert_equal([states_of(path, []) for path in paths], whole)
+    texts[0].write_bytes(texts[0].read_text("utf-8-sig").encode("utf-16"))
+    with pytest.raises(InputError, match=r"is no text in UTF-8; expected cfclient's CSV"):
+        states_of(paths[0], [])
+
+
 @pytest.mark.parametrize("sqlite", [False, True])
 def test_compressed_bags_are_read_with_and_without_their_metadata(sqlite: bool, tmp_path: Path) -> None:
     records = swaying(60)

@@ -204,6 +204,10 @@ class TestPlantFile:
         validate(cli.apply_plant(PAIR, self.write(tmp_path, light)))
         assert "weigh and measure" in command.report(PAIR, light)
 
+    def test_a_delay_at_the_end_of_its_range_is_told(self) -> None:
+        for delay, told in ((0.0, True), (0.008, False), (0.06, True)):
+            assert ("by one clock" in command.report(PAIR, SOME._replace(delay=delay))) is told
+
     def test_train_takes_it_with_its_preset(self, tmp_path: Path) -> None:
         options = train.parser().parse_args(["--plant", str(self.write(tmp_path)), "--out", str(tmp_path / "run")])
         settings, _, _ = new_run.new_run(options, "")

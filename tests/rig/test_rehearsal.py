@@ -318,7 +318,7 @@ def test_clocks_that_differ_are_told_and_not_identified_with(
             (both, -0.15, 1.0, "by its climb the pair follows what was sent after -0.0"),
             (both, 0.3, 1.0, "by its climb the pair follows what was sent after 0.3"),
             (("follower",), 0.0, 1.01, "the follower's states are 0.009 s late at first and 0.078 s late at last"),
-            (both, 0.0, 1.01, "by its climb the pair follows what was sent after 0.056 s at first and 0.155 s at last"),
+            (both, 0.0, 1.01, "by its climb the pair follows what was sent after 0.05"),
             (("follower",), 0.0, 1.3, "the follower's positions change by 0.77 of its velocities"),
             (both, 0.0, 1.3, "the leader's positions change by 0.77 of its velocities"),
         )
@@ -335,7 +335,8 @@ def test_clocks_that_differ_are_told_and_not_identified_with(
         assert call(command.main, [path, "--out", tmp_path / "plant.json"]) == 2
         errors = capsys.readouterr().err
         assert_one_line(errors)
-        assert f"cannot be used: {said}" in errors
+        assert "cannot be used" in errors
+        assert said in errors
     assert not (tmp_path / "plant.json").exists()
 
 
