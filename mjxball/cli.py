@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
 import difflib
 import gc
 import os
@@ -18,17 +19,24 @@ from typing import Any
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
+from mjxball.reading import LARGEST, SMALLEST, is_number, shown
 from mjxball.terminal import warn
 from mjxball.xla import explained
 
 FAULT = 3  # exit code after an error of the program, where 1 is a result
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
 SHELLS = ("bash", "zsh", "tcsh")
+LONGEST = 900  # characters of a sentence about a mistake
 Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one sentence on stderr and exit code 2."""
+    """An argument parser whose errors are one sentence on stderr and exit code 2, and whose numbers are bounded."""
+
+    def __init__(self, *given: Any, **named: Any):
+        super().__init__(*given, **named)
+        self.register("type", float, lambda text: _number(text, float))
+        self.register("type", int, lambda text: _number(text, int))
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -47,7 +55,7 @@ class Parser(argparse.ArgumentParser):
         unknown = re.match(r"unrecognized arguments: (--[^ =]+)", message)
         known = [flag for action in self._actions if action.help != argparse.SUPPRESS for flag in action.option_strings]
         similar = difflib.get_close_matches(unknown[1], known, 1, cutoff=0.8) if unknown else []
-        warn(f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}")
+        warn(_sentence(f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}"))
         self.exit(2)
 
     def _print_message(self, message: str, file: Any = None) -> None:
@@ -59,6 +67,21 @@ class Parser(argparse.ArgumentParser):
 
         if code := run_command(write):
             self.exit(code)
+
+
+def _number(text: str, kind: type[float] | type[int]) -> float:
+    """What any flag that takes a number is given. Raises ArgumentTypeError if nothing can be computed with it."""
+    with contextlib.suppress(ValueError):
+        if is_number(number := kind(text)):
+            return number
+    wanted = "a whole number" if kind is int else f"a number, 0 or from {SMALLEST:g} to {LARGEST:g} in size"
+    raise argparse.ArgumentTypeError(f"takes {wanted}, not {shown(text)}")
+
+
+def _sentence(text: str) -> str:
+    """`text` in one line that a person can read."""
+    line = " ".join(text.splitlines())
+    return line if len(line) <= LONGEST else f"{line[:LONGEST]} ..."
 
 
 class Formatter(argparse.HelpFormatter):
@@ -195,7 +218,7 @@ def run_command(command: Callable[[], int]) -> int:
             sys.stdout.flush()
         return code
     except InputError as error:
-        warn(f"error: {' '.join(str(error).splitlines())}")
+        warn(_sentence(f"error: {error}"))
         return 2
     except OSError as error:
         where = error.filename or "standard output or a file"

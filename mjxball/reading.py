@@ -1,4 +1,7 @@
-"""What files of others must be: JSON that says everything once, and time that runs forward. Standard library only."""
+"""What files of others must be: JSON that says everything once, numbers to compute with, time that runs forward.
+
+Standard library only.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,15 @@ import itertools
 import json
 import math
 import statistics
+import tomllib
 from collections.abc import Sequence
 from typing import Any
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
 GAP = 5.0  # steps from which on a recording has a hole
 STRAY = 0.1  # share of rows whose time may not follow
+LARGEST, SMALLEST = 1e12, 1e-30  # sizes of a number that is not 0: products of others are endless or 0 in float32
+MOST_DIGITS = 20  # of a whole number, which 64 bits hold; Python would take thousands, and no float does
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -20,7 +26,39 @@ def parse_json(text: str | bytes) -> Any:
 
     The standard leaves open which of both counts; Python would take the last one without a word.
     """
-    return json.loads(text, object_pairs_hook=_once)
+    return json.loads(text, object_pairs_hook=_once, parse_int=_whole)
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The values of a TOML text. Raises ValueError; RecursionError if too deep."""
+    values = tomllib.loads(text)
+    rest: list[Any] = [values]
+    while rest:
+        one = rest.pop()
+        if isinstance(one, (dict, list)):
+            rest += one.values() if isinstance(one, dict) else one
+        elif isinstance(one, int) and abs(one) >= 10**MOST_DIGITS:
+            _whole(str(one))
+    return values
+
+
+def is_number(value: Any, most: float = LARGEST) -> bool:
+    """Whether `value` is a number that can be computed with: no truth value, 0 or from `SMALLEST` to `most` in size."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return value == 0 or SMALLEST <= abs(value) <= most
+
+
+def shown(value: Any) -> str:
+    """`value` of a file or a command line as a sentence shows it."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}..."
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"a whole number has {len(digits)} digits, more than {MOST_DIGITS}")
+    return int(digits)
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -9,20 +9,27 @@ Vector3 = tuple[float, float, float]
 Range = tuple[float, float]
 
 
+MOST = 32  # numbers in a tuple of any length
+
+
 def setting(
     default: Any,
     about: str,
     *,
-    above: float | None = None,
     low: float | None = None,
     high: float | None = None,
     ordered: bool = False,
+    most: int = MOST,
 ) -> Any:
-    """Declare a leaf: default, help text, and bounds that hold for each of its numbers.
+    """Declare a leaf: default, help text, and the range in which each of its numbers must lie, both ends included.
 
-    `above` is exclusive, `low` and `high` are inclusive, `ordered` asks for low <= high in a range.
+    Every number has one. It is what some flight or training could want, not what is wise; those of a plant leave room
+    for a wrong unit, which `_plausible` names. `ordered` asks for low <= high of a pair; a tuple of any length holds at
+    most `most` numbers.
     """
-    bounds = {"about": about, "above": above, "low": low, "high": high, "ordered": ordered}
+    if (low is None or high is None) and not isinstance(default, (bool, str)):
+        raise TypeError(f"the setting of default {default!r} has no range: {about}")
+    bounds = {"about": about, "low": low, "high": high, "ordered": ordered, "most": most}
     return field(default=default, metadata=bounds)
 
 

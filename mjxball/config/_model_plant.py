@@ -19,6 +19,7 @@ from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
 from mjxball.errors import InputError
+from mjxball.reading import is_number
 
 ARM = 0.12  # of a drone of 1 kg; goes with the cube root of its mass [m]
 SPACING = 0.34 / 0.12  # distance of neighbours over the arm
@@ -29,7 +30,6 @@ CARRIER = 0.05  # mass of a team's carrier over that of its drones
 WIDTH, HEIGHT, BALL, AMPLITUDE = 0.10 / 0.34, 0.05 / 0.34, 0.02 / 0.34, 0.05 / 0.34  # over the object's length
 SQUARE = 0.3  # of the arm that a rotor may be off a square cross
 SHOWN = 0.01  # of the arm or of the inertia: what is left out beyond it has a line
-LARGEST = 1e12  # of a number that is taken for what follows from it
 LINE = 20.0  # times as far apart along an axis as across it are two drones on a line
 SHARED = ("arm", "rotor_force_max", "rotor_lag", "yaw_per_thrust")  # of a drone, or of all
 QUARTERS = math.pi / 2 * np.arange(4)
@@ -63,7 +63,7 @@ class _Settings:
     def number(self, name: str) -> float:
         """plant.`name` as the user says it, unless no plant may have that, else as it was found, or 0."""
         said, found = self.said.get(f"plant.{name}"), self.found.get(f"plant.{name}", 0.0)
-        return float(said if isinstance(said, (int, float)) and 0 < said < LARGEST else found)
+        return float(said if is_number(said) and said > 0 else found)
 
 
 def plant_of(model: Model, said: Mapping[str, Any], count: int | None) -> tuple[dict[str, Any], list[str]]:

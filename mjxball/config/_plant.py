@@ -13,14 +13,18 @@ from mjxball.errors import InputError
 class Drone:
     """One drone and where it sits. Zeros behind `yaw` stand for the plant's own number, which all drones share."""
 
-    mass: float = setting(1.0, "mass of the drone [kg]", above=0)
-    inertia: Vector3 = setting((2.3e-3, 2.3e-3, 4.0e-3), "principal inertia about its own axes [kg m2]", above=0)
-    mount: Vector3 = setting((0.0, 0.0, 0.0), "centre of the drone from O, body axes [m]")
+    mass: float = setting(1.0, "mass of the drone [kg]", low=1e-6, high=1e5)
+    inertia: Vector3 = setting(
+        (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia about its own axes [kg m2]", low=1e-12, high=1e8
+    )
+    mount: Vector3 = setting((0.0, 0.0, 0.0), "centre of the drone from O, body axes [m]", low=-1e5, high=1e5)
     yaw: float = setting(0.0, "angle about body z by which it is turned on the carrier [rad]", low=-6.3, high=6.3)
-    arm: float = setting(0.0, "its centre to each rotor, 0: plant.arm [m]", low=0)
-    rotor_force_max: float = setting(0.0, "largest force of one rotor, 0: plant.rotor_force_max [N]", low=0)
-    rotor_lag: float = setting(0.0, "time constant of a rotor's force, 0: plant.rotor_lag [s]", low=0)
-    yaw_per_thrust: float = setting(0.0, "yaw moment of a rotor over its force, 0: plant.yaw_per_thrust [m]", low=0)
+    arm: float = setting(0.0, "its centre to each rotor, 0: plant.arm [m]", low=0, high=1e5)
+    rotor_force_max: float = setting(0.0, "largest force of one rotor, 0: plant.rotor_force_max [N]", low=0, high=1e6)
+    rotor_lag: float = setting(0.0, "time constant of a rotor's force, 0: plant.rotor_lag [s]", low=0, high=1e4)
+    yaw_per_thrust: float = setting(
+        0.0, "yaw moment of a rotor over its force, 0: plant.yaw_per_thrust [m]", low=0, high=1e5
+    )
 
 
 @dataclass(frozen=True)
@@ -28,17 +32,25 @@ class Plant:
     """A rigid carrier, the drones on it, one of which leads, and a load that moves. Defaults are the `paper` plant."""
 
     drones: tuple[Drone, ...] = (Drone(mount=(0.17, 0.0, 0.0)), Drone(mount=(-0.17, 0.0, 0.0)))
-    leader: int = setting(0, "number of the drone that leads, counted from 0", low=0)
-    carrier_mass: float = setting(0.0, "mass of the carrier, besides the object's part that does not move [kg]", low=0)
-    carrier_inertia: Vector3 = setting((0.0, 0.0, 0.0), "principal inertia of the carrier about O [kg m2]", low=0)
-    object_mass: float = setting(0.2, "nominal mass of the object, all of it moving with the CG [kg]", above=0)
-    object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
-    moving_fraction: float = setting(
-        1.0, "share of the object's mass that moves; the rest is a fixed box about O", above=0, high=1
+    leader: int = setting(0, "number of the drone that leads, counted from 0", low=0, high=15)
+    carrier_mass: float = setting(
+        0.0, "mass of the carrier, besides the object's part that does not move [kg]", low=0, high=1e5
     )
-    ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
+    carrier_inertia: Vector3 = setting(
+        (0.0, 0.0, 0.0), "principal inertia of the carrier about O [kg m2]", low=0, high=1e8
+    )
+    object_mass: float = setting(
+        0.2, "nominal mass of the object, all of it moving with the CG [kg]", low=1e-12, high=1e5
+    )
+    object_size: Vector3 = setting(
+        (0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", low=0.0001, high=1e5
+    )
+    moving_fraction: float = setting(
+        1.0, "share of the object's mass that moves; the rest is a fixed box about O", low=0.0001, high=1
+    )
+    ball_radius: float = setting(0.02, "radius of the moving ball [m]", low=0.0001, high=1e4)
     ball_stop: float = setting(
-        0.0, "ball's centre from O at an end stop or at the rim, 0: it touches the object's end [m]", low=0
+        0.0, "ball's centre from O at an end stop or at the rim, 0: it touches the object's end [m]", low=0, high=1e4
     )
     cg_axis: Literal["x", "y", "xy"] = setting(
         "x", "body axis along which the CG moves and a pair is mounted; xy: it moves in the plane"
@@ -46,14 +58,14 @@ class Plant:
     stand: Literal["free", "pivot", "heave"] = setting(
         "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
     )
-    arm: float = setting(0.12, "centre of a drone to each rotor [m]", above=0)
+    arm: float = setting(0.12, "centre of a drone to each rotor [m]", low=0.001, high=1e5)
     layout: Literal["plus", "x"] = setting(
         "plus", "rotors on the body axes, 1 at +x, 2 at +y; or between them as on a Crazyflie, 1 at +x -y, 2 at -x -y"
     )
-    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", above=0)
-    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", above=0)
-    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
-    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", above=0)
+    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", low=0.0001, high=1e6)
+    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", low=0.0001, high=1e4)
+    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", low=1e-5, high=1e5)
+    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", low=0.01, high=1e4)
 
     def __repr__(self) -> str:
         """Short: `to_json` has all of it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from mjxball.config._tree import apply_overrides, leaves, override
 from mjxball.config._validate import MOST_DRONES, check_leaves, validate
 from mjxball.errors import InputError
 from mjxball.files import MissingFileError, read_text
-from mjxball.reading import parse_json
+from mjxball.reading import parse_json, parse_toml
 
 PLANT_PARTS = ("plant", "attitude", "autopilot", "leader", "scenario", "motion")  # what a plant file may set
 SHIPPED = Path(__file__).parent / "plants"
@@ -113,7 +112,7 @@ def _parsed(path: Path) -> dict[str, Any]:
     except MissingFileError as error:
         raise InputError(f"{error}; by name there are {', '.join(PLANTS)}") from None
     try:
-        values = tomllib.loads(text) if kind == "TOML" else parse_json(text)
+        values = parse_toml(text) if kind == "TOML" else parse_json(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"plant file {path} is not {kind}: {error}") from None
     if not isinstance(values, dict) or not values:

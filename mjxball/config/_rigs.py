@@ -15,7 +15,9 @@ class Rigs:
     moves and what disturbs.
     """
 
-    number: int = setting(0, "rigs of each size that training draws its worlds from; 0: the plant's own", low=0)
+    number: int = setting(
+        0, "rigs of each size that training draws its worlds from; 0: the plant's own", low=0, high=1_000_000
+    )
     mass_step: float = setting(
         0.0,
         "in flight the object's mass changes by up to this share of itself, as far as that can be trimmed",

@@ -18,12 +18,16 @@ class Motion:
     kind: Literal["sine", "waveform", "rolling"] = setting(
         "sine", "sine: drawn or given per flight; waveform: the samples below; rolling: a free ball with end stops"
     )
-    times: tuple[float, ...] = setting((), "waveform: increasing sample times [s]")
+    times: tuple[float, ...] = setting((), "waveform: increasing sample times [s]", low=-1e5, high=1e5, most=100_000)
     offsets: tuple[float, ...] = setting(
-        (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]"
+        (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]", low=-1e4, high=1e4
     )
     offsets_across: tuple[float, ...] = setting(
-        (), "waveform in the plane: CG offsets along body y at those times, and offsets are those along x [m]"
+        (),
+        "waveform in the plane: CG offsets along body y at those times, and offsets are those along x [m]",
+        low=-1e4,
+        high=1e4,
+        most=100_000,
     )
 
 
@@ -31,9 +35,11 @@ class Motion:
 class Attitude:
     """The PD attitude loop that each drone runs once per physics step (ours)."""
 
-    natural_frequency: Vector3 = setting((10.0, 10.0, 4.0), "natural frequency of roll, pitch, yaw [rad/s]", above=0)
-    damping: float = setting(0.9, "damping ratio", above=0)
-    design_object_mass: float = setting(0.2, "object mass that the gains are for [kg]", low=0)
+    natural_frequency: Vector3 = setting(
+        (10.0, 10.0, 4.0), "natural frequency of roll, pitch, yaw [rad/s]", low=0.01, high=1e4
+    )
+    damping: float = setting(0.9, "damping ratio", low=0.01, high=10)
+    design_object_mass: float = setting(0.2, "object mass that the gains are for [kg]", low=0, high=1e5)
 
 
 @dataclass(frozen=True)
@@ -43,17 +49,22 @@ class Autopilot:
     """
 
     kind: Literal["ideal", "crazyflie"] = setting("ideal", "ideal: PD of `attitude`; crazyflie: the firmware's cascade")
-    roll: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.roll_kp, ki, kd [1/s, 1/s2, 1]", low=0)
-    pitch: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.pitch_kp, ki, kd", low=0)
-    yaw: Vector3 = setting((6.0, 1.0, 0.35), "pid_attitude.yaw_kp, ki, kd", low=0)
-    roll_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0)
-    pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0)
-    yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0)
+    roll: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.roll_kp, ki, kd [1/s, 1/s2, 1]", low=0, high=1000)
+    pitch: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.pitch_kp, ki, kd", low=0, high=1000)
+    yaw: Vector3 = setting((6.0, 1.0, 0.35), "pid_attitude.yaw_kp, ki, kd", low=0, high=1000)
+    roll_rate: Vector3 = setting(
+        (250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0, high=1e5
+    )
+    pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0, high=1e5)
+    yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0, high=1e5)
     follower_ki_scale: float = setting(
         1.0, "factor on the follower's ki: two drones that integrate on one body work against each other", low=0, high=1
     )
     motor_curve: Range = setting(
-        (0.0915, 0.0677), "force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]", low=0
+        (0.0915, 0.0677),
+        "force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]",
+        low=0,
+        high=1000,
     )
     drone: Literal["", "2.1", "2.1-legacy", "thrust-upgrade", "brushless"] = setting(
         "", "whose motors follow the battery where scenario.battery is drawn; empty: unknown, they follow the curve"
@@ -61,28 +72,32 @@ class Autopilot:
     thrust_law: Literal["calibrated", "paper"] = setting(
         "calibrated", "calibrated: the motor curve at m (g + az); paper: hover_thrust + thrust_per_acceleration az"
     )
-    hover_thrust: float = setting(46000.0, "thr_hov of the paper's law, calibrated for each rig", low=0, high=60000)
-    thrust_per_acceleration: float = setting(1000.0, "k_pz of the paper's law [1/(m/s2)]", low=0)
+    hover_thrust: float = setting(46000.0, "thr_hov of the paper's law, calibrated for each rig", low=0, high=60_000)
+    thrust_per_acceleration: float = setting(1000.0, "k_pz of the paper's law [1/(m/s2)]", low=0, high=60_000)
 
 
 @dataclass(frozen=True)
 class Leader:
     """The leader's PID law (paper eq. 5) and its command limits."""
 
-    kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0)
-    kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0)
-    ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0)
-    integral_error_limit: Vector3 = setting((1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", above=0)
+    kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0, high=1000)
+    kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0, high=1000)
+    ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0, high=1000)
+    integral_error_limit: Vector3 = setting(
+        (1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", low=0.001, high=1e6
+    )
     integral_lead_time: float = setting(
         0.0,
         "the integrated error is error + this * its rate, within the limit: nothing winds up on the way to a goal [s]",
         low=0,
+        high=1000,
     )
     tilt_integral_gain: float = setting(
         0.0,
         "difference of both drones' lift for the time integral of the carrier's tilt error about the axis that "
         "the load turns, with follower.residual_on_pid [m/s2 per rad s]",
         low=0,
+        high=1e4,
     )
     error: Literal["object", "own"] = setting(
         "object", "what it flies on: e_o of the object, or e_l of its own place, goal + its mount (the paper's stand)"
@@ -93,8 +108,8 @@ class Leader:
 class Command:
     """Limits of what any drone is sent, leader or follower."""
 
-    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
-    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
+    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", low=0.001, high=1.2)
+    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", low=0.001, high=1000)
 
 
 @dataclass(frozen=True)
@@ -104,8 +119,8 @@ class Follower:
     action: Literal["residual", "direct"] = setting(
         "residual", "residual: added to the PD law on its own observation; direct: the command itself"
     )
-    action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
-    action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)
+    action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", low=0.0001, high=1.2)
+    action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", low=0.0001, high=1000)
     residual_on_pid: bool = setting(
         False,
         "a residual action is added to the leader's PID law, integrals included, not to its PD part alone, behind a "
@@ -121,7 +136,10 @@ class Follower:
     ignore_position: bool = setting(True, "the network does not see the absolute position")
     previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
     observation_averages: tuple[float, ...] = setting(
-        (), "time constants of exponential averages of observations and actions that the network sees [s]", above=1e-3
+        (),
+        "time constants of exponential averages of observations and actions that the network sees [s]",
+        low=0.001,
+        high=1000,
     )
     recurrent_units: int = setting(
         0, "units of a GRU whose state the network carries from step to step; 0: none", low=0, high=512
@@ -133,35 +151,39 @@ class Follower:
 class Timing:
     """Clock rates."""
 
-    control_period: float = setting(0.02, "time between two commands [s]", low=1e-3)
+    control_period: float = setting(0.02, "time between two commands [s]", low=0.001, high=1)
     physics_steps: int = setting(4, "physics and attitude-loop steps in a control period", low=1, high=1000)
-    episode_steps: int = setting(1000, "control steps of a training episode, then truncated", low=1)
+    episode_steps: int = setting(1000, "control steps of a training episode, then truncated", low=1, high=10**6)
 
 
 @dataclass(frozen=True)
 class ScenarioRanges:
     """What every reset draws anew, uniformly from each range."""
 
-    goal_range: float = setting(1.0, "each coordinate of the goal is drawn from +- this [m]", low=0)
-    start_position: float = setting(0.0, "each coordinate of the start is drawn from +- this [m]", low=0)
-    start_velocity: float = setting(0.0, "each start velocity is drawn from +- this [m/s]", low=0)
-    start_tilt: float = setting(0.0, "start roll and pitch are drawn from +- this [rad]", low=0, high=1.0)
-    cg_speed: Range = drawn((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0)
-    cg_amplitude: Range = drawn((0.05, 0.05), "amplitude of the CG's sine [m]", low=0)
-    object_mass: Range = drawn((0.2, 0.2), "true mass of the object [kg]", above=0)
+    goal_range: float = setting(1.0, "each coordinate of the goal is drawn from +- this [m]", low=0, high=1e4)
+    start_position: float = setting(0.0, "each coordinate of the start is drawn from +- this [m]", low=0, high=1e4)
+    start_velocity: float = setting(0.0, "each start velocity is drawn from +- this [m/s]", low=0, high=100)
+    start_tilt: float = setting(0.0, "start roll and pitch are drawn from +- this [rad]", low=0, high=1)
+    cg_speed: Range = drawn((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, high=1000)
+    cg_amplitude: Range = drawn((0.05, 0.05), "amplitude of the CG's sine [m]", low=0, high=1e4)
+    object_mass: Range = drawn((0.2, 0.2), "true mass of the object [kg]", low=1e-12, high=1e5)
     trim_margin: float = setting(
         0.15,
         "the CG's amplitude is cut to where one drone holds it with this share of its torque left; negative: beyond",
         low=-0.5,
         high=1,
     )
-    mass_change: Range = drawn((0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]")
-    ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
-    ball_speed: float = setting(0.0, "rolling: it starts with up to this speed [m/s]", low=0)
-    noise: Range = drawn((0.0, 0.0), "measurement noise, in standard deviations of motion capture and IMU", low=0)
+    mass_change: Range = drawn(
+        (0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]", low=-1e5, high=1e5
+    )
+    ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0, high=1e4)
+    ball_speed: float = setting(0.0, "rolling: it starts with up to this speed [m/s]", low=0, high=100)
+    noise: Range = drawn(
+        (0.0, 0.0), "measurement noise, in standard deviations of motion capture and IMU", low=0, high=100
+    )
     delay: Range = drawn((0.0, 0.0), "delay of the follower's measurements [s]", low=0, high=0.5)
     estimator_drift: Range = drawn(
-        (0.0, 0.0), "slow measurement error, in standard deviations of a drone's estimator", low=0
+        (0.0, 0.0), "slow measurement error, in standard deviations of a drone's estimator", low=0, high=100
     )
     calm_probability: float = setting(
         0.0, "probability of a flight without noise, drift and gusts, whatever its delay", low=0, high=1
@@ -170,20 +192,21 @@ class ScenarioRanges:
     leader_uses_measurements: bool = setting(
         False, "the leader flies on the follower's measurements, else on the true state"
     )
-    battery: Range = drawn((0.0, 0.0), "voltage of the battery; 0: motors follow the curve [V]", low=0)
+    battery: Range = drawn((0.0, 0.0), "voltage of the battery; 0: motors follow the curve [V]", low=0, high=100)
     uncompensated_probability: float = setting(
         0.0, "probability of a firmware that does not compensate for the battery", low=0, high=1
     )
-    gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0)
-    rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", above=0)
-    thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0)
-    thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)
-    inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", above=0)
+    gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, high=1e4)
+    rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", low=0.01, high=100)
+    thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", low=0.01, high=100)
+    thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", low=0.01, high=100)
+    inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", low=0.01, high=100)
     cg_width: Range = drawn(
         (0.0, 0.0),
         "in the plane: amplitude of the CG's second sine, across the first one, over that one's; in three flights of "
         "ten it is twice as fast, else the path is an ellipse",
         low=0,
+        high=100,
     )
     cg_waypoint_probability: float = setting(
         0.0, "probability that the CG moves between random waypoints instead of in a sine", low=0, high=1
@@ -195,14 +218,18 @@ class ScenarioRanges:
         low=2,
         high=16,
     )
-    drone_mass_scale: Range = drawn((1.0, 1.0), "factor on the drones' masses, which their hover thrust knows", above=0)
-    drone_inertia_scale: Range = drawn((1.0, 1.0), "factor on all drones' own inertia", above=0)
-    mount_scale: Range = drawn((1.0, 1.0), "factor on all mounts' distances from O", above=0)
-    arm_scale: Range = drawn((1.0, 1.0), "factor on all rotors' arms", above=0)
-    yaw_per_thrust_scale: Range = drawn((1.0, 1.0), "factor on all rotors' yaw moment over force", above=0)
-    rotor_force_scale: Range = drawn((1.0, 1.0), "factor on all rotors' largest force", above=0)
-    carrier_scale: Range = drawn((1.0, 1.0), "factor on the carrier's mass and inertia, which is known", above=0)
-    attitude_gain_scale: Range = drawn((1.0, 1.0), "factor on all attitude gains", above=0)
+    drone_mass_scale: Range = drawn(
+        (1.0, 1.0), "factor on the drones' masses, which their hover thrust knows", low=0.01, high=100
+    )
+    drone_inertia_scale: Range = drawn((1.0, 1.0), "factor on all drones' own inertia", low=0.01, high=100)
+    mount_scale: Range = drawn((1.0, 1.0), "factor on all mounts' distances from O", low=0.01, high=100)
+    arm_scale: Range = drawn((1.0, 1.0), "factor on all rotors' arms", low=0.01, high=100)
+    yaw_per_thrust_scale: Range = drawn((1.0, 1.0), "factor on all rotors' yaw moment over force", low=0.01, high=100)
+    rotor_force_scale: Range = drawn((1.0, 1.0), "factor on all rotors' largest force", low=0.01, high=100)
+    carrier_scale: Range = drawn(
+        (1.0, 1.0), "factor on the carrier's mass and inertia, which is known", low=0.01, high=100
+    )
+    attitude_gain_scale: Range = drawn((1.0, 1.0), "factor on all attitude gains", low=0.01, high=100)
     lost_follower_probability: float = setting(
         0.0, "probability that one follower's rotors stop, 3 to 15 s after the start", low=0, high=1
     )
@@ -213,8 +240,10 @@ class ScenarioRanges:
         low=0,
         high=1,
     )
-    unknown_mass: Range = drawn((0.1, 0.35), "true mass of the object in these flights [kg]", above=0)
-    termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
+    unknown_mass: Range = drawn((0.1, 0.35), "true mass of the object in these flights [kg]", low=1e-12, high=1e5)
+    termination_distance: float = setting(
+        2.5, "an episode ends when |e_o| exceeds this, d_term [m]", low=0.01, high=1e6
+    )
 
 
 @dataclass(frozen=True)
@@ -222,42 +251,54 @@ class Reward:
     """Reward of one control step. `paper` mimics the leader; `task` (ours) scores what the user wants."""
 
     kind: Literal["paper", "task"] = setting("task", "paper (leader mimicry) or task (balance)")
-    error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0)
-    error_scale: float = setting(0.1, "|e_o| at which the error's cost turns from square to linear [m]", above=0)
-    velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0)
-    tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0)
-    rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0)
-    effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
-    smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0)
+    error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0, high=1e6)
+    error_scale: float = setting(
+        0.1, "|e_o| at which the error's cost turns from square to linear [m]", low=1e-6, high=1000
+    )
+    velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0, high=1e6)
+    tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0, high=1e6)
+    rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0, high=1e6)
+    effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0, high=1e6)
+    smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0, high=1e6)
     command_change: float = setting(
         0.0,
         "weight of the squared change of the follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command",
         low=0,
+        high=1e6,
     )
-    ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0)
+    ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0, high=1e6)
     steady_action: float = setting(
-        0.0, "weight of the squared slowest average of the network action: what stands is the integrals' part", low=0
+        0.0,
+        "weight of the squared slowest average of the network action: what stands is the integrals' part",
+        low=0,
+        high=1e6,
     )
     tilt_disagreement: float = setting(
-        0.0, "weight of the squared difference of both drones' tilt commands about the axis that no load turns", low=0
+        0.0,
+        "weight of the squared difference of both drones' tilt commands about the axis that no load turns",
+        low=0,
+        high=1e6,
     )
     spread: float = setting(
         0.0,
         "weight of the squared differences of a follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command to "
         "the mean of all followers: they are not to work against each other",
         low=0,
+        high=1e6,
     )
-    termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
+    termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0, high=1e6)
 
 
 @dataclass(frozen=True)
 class Bounds:
     """What `eval.py --check` enforces for the exported policy on the reference scenario; 0 leaves a metric free."""
 
-    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0)
-    settling_time: float = setting(4.0, "2 % settling time [s]", low=0)
-    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", low=0)
-    action_error: float = setting(0.0, "rms of the command less the leader's, over all three [rad, m/s2]", low=0)
+    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0, high=1000)
+    settling_time: float = setting(4.0, "2 % settling time [s]", low=0, high=1e5)
+    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", low=0, high=1000)
+    action_error: float = setting(
+        0.0, "rms of the command less the leader's, over all three [rad, m/s2]", low=0, high=1000
+    )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from mjxball.config._plant import Drone
 from mjxball.config._renamed import CONSTANT, check_constant, current_name, with_current_names
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
+from mjxball.reading import shown
 
 MAX_LISTED = 6
 
@@ -115,7 +116,7 @@ def _parse(path: str, text: str, example: Any, kind: type) -> Any:
     except (ValueError, KeyError):
         several = f"comma-separated {'whole ' if kind is int else ''}numbers"
         wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: several}
-        raise InputError(f"--{path} takes {wanted[type(example)]}, not {text!r}") from None
+        raise InputError(f"--{path} takes {wanted[type(example)]}, not {shown(text)}") from None
 
 
 def _near(name: str, known: Iterable[str]) -> str:

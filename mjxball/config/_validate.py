@@ -14,8 +14,8 @@ from mjxball.config._plausible import check_units
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
 from mjxball.errors import InputError
+from mjxball.reading import SMALLEST, is_number, shown
 
-LARGEST = 1e12  # of any number in a configuration
 MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
 
 
@@ -28,11 +28,11 @@ def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> No
     if typing.get_origin(hint) is Literal:
         if value not in typing.get_args(hint):
             allowed = " or ".join(str(choice) for choice in typing.get_args(hint))
-            raise InputError(f"{path} must be {allowed}, not {value!r}")
+            raise InputError(f"{path} must be {allowed}, not {shown(value)}")
         return
     if hint is bool:
         if not isinstance(value, bool):
-            raise InputError(f"{path} must be true or false, not {value!r}")
+            raise InputError(f"{path} must be true or false, not {shown(value)}")
         return
     if typing.get_origin(hint) is not tuple:
         _check_number(path, value, hint, item.metadata)
@@ -40,9 +40,11 @@ def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> No
     kinds = typing.get_args(hint)
     if not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
         count = "several" if Ellipsis in kinds else str(len(kinds))
-        raise InputError(f"{path} takes {count} numbers, not {value!r}")
+        raise InputError(f"{path} takes {count} numbers, not {shown(value)}")
     if not value and item.default:
         raise InputError(f"{path} must hold at least one number")
+    if len(value) > item.metadata["most"]:
+        raise InputError(f"{path} takes at most {item.metadata['most']:,} numbers, not {len(value):,}")
     for number in value:
         _check_number(path, number, kinds[0], item.metadata)
     if item.metadata["ordered"] and value[0] > value[1]:
@@ -52,15 +54,11 @@ def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> No
 def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
     allowed = (int,) if kind is int else (int, float)
     if isinstance(number, bool) or not isinstance(number, allowed):
-        raise InputError(f"{path} takes {'whole numbers' if kind is int else 'numbers'}, not {number!r}")
-    if not abs(number) <= LARGEST:
-        raise InputError(f"{path} must be finite and at most {LARGEST:g}, not {number!r}")
-    if bounds["above"] is not None and number <= bounds["above"]:
-        raise InputError(f"{path} must be greater than {bounds['above']:g}, not {number:g}")
-    if bounds["low"] is not None and number < bounds["low"]:
-        raise InputError(f"{path} must be at least {bounds['low']:g}, not {number:g}")
-    if bounds["high"] is not None and number > bounds["high"]:
-        raise InputError(f"{path} must be at most {bounds['high']:g}, not {number:g}")
+        raise InputError(f"{path} takes {'whole numbers' if kind is int else 'numbers'}, not {shown(number)}")
+    if not bounds["low"] <= number <= bounds["high"]:
+        raise InputError(f"{path} must be between {bounds['low']:g} and {bounds['high']:g}, not {shown(number)}")
+    if not is_number(number):
+        raise InputError(f"{path} must be 0 or at least {SMALLEST:g} in size, not {shown(number)}")
 
 
 def check_leaves(config: Config) -> None:

@@ -12,13 +12,12 @@ import numpy as np
 
 from mjxball.errors import InputError, said
 from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, VARIABLES, WIDTHS, Series
+from mjxball.fly.log_unpack import Unpacking, check_tables
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
-BAGS, PACKED = (".mcap", ".db3"), ".zstd"
+BAGS, COMPRESSED = (".mcap", ".db3"), ".zstd"
 CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ as a rule
 ASTRAY = 1  # [s] by which one of them may: a stamp of 0 says that the message is of no time
-COMPRESSED = b"\x28\xb5\x2f\xfd"  # first bytes of what zstd compressed, which no message in CDR begins with
-MOST_EXPANDED, MOST_MESSAGE = 2**30, 2**24  # bytes of what was compressed
 SHOWN = 6  # topics that a sentence names
 
 
@@ -38,78 +37,53 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
         raise InputError("reading a bag needs rosbags; pip install 'mjxball[logs]'") from None
     from rosbags.typesys import Stores, get_typestore
 
-    with tempfile.TemporaryDirectory() as spare:
-        files = [_whole(_expanded(file, Path(spare)), Path(spare), remark) for file in _files(path)]
+    found = _files(path)
+    unpacking = Unpacking(path, sum(file.stat().st_size for file in found))
+    with tempfile.TemporaryDirectory() as spare, unpacking.bounding():
         try:
+            files = [_whole(_unpacked(file, Path(spare), unpacking), Path(spare), remark, unpacking) for file in found]
             with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-                return _contents(path, reader)
+                return _contents(path, reader, unpacking)
         except InputError:
             raise
         except Exception as error:  # of any of the libraries that read it
-            if "Invalid bag metadata" in str(error):
-                raise InputError(
-                    f"bag {path} has a metadata.yaml with a value of another type; expected the one that rosbag2 wrote"
-                ) from None
+            unpacking.refuse()
             raise InputError(f"bag {path} cannot be read: {said(error)}") from None
 
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is called as a bag's file is, compressed or not."""
-    return path.name.removesuffix(PACKED).endswith(BAGS)
+    return path.name.removesuffix(COMPRESSED).endswith(BAGS)
 
 
 def _files(path: Path) -> list[Path]:
-    """The bag `path` itself, or the files of a folder that has no metadata, or one for files that are not whole."""
+    """The bag `path` itself, or the files of a folder; they hold all that its metadata.yaml says."""
     if path.is_file():
         return [path]
     inside = [path, *path.iterdir()] if path.is_dir() else [path]
     if odd := [one for one in inside if one.exists() and not one.is_file() and not one.is_dir()]:
         raise InputError(f"bag {odd[0]} is no regular file")
-    found = sorted(one for one in path.iterdir() if is_bag(one) and one.is_file()) if path.is_dir() else []
-    if (path / "metadata.yaml").is_file() and all(one.suffix != ".mcap" or _ends(one) for one in found):
-        return [path]
+    files = [one for one in path.iterdir() if one.is_file()] if path.is_dir() else []
+    found = sorted(filter(is_bag, files))
     if not found:
-        what = "is a folder without metadata.yaml, .mcap or .db3" if path.exists() else "does not exist"
+        what = "is a folder without .mcap or .db3" if path.exists() else "does not exist"
         raise InputError(f"bag {path} {what}; expected a rosbag2 file or folder, or cfclient's leader and follower")
     return found
 
 
-def _expanded(path: Path, spare: Path) -> Path:
-    """`path`, or in the folder `spare` what was compressed into it. Raises InputError: that is too much."""
-    if path.is_dir() or path.suffix != PACKED:
+def _unpacked(path: Path, spare: Path, unpacking: Unpacking) -> Path:
+    """`path`, or in the folder `spare` what it was compressed from."""
+    if path.suffix != COMPRESSED:
         return path
-    import zstandard
-
-    copy = spare / path.stem
-    with path.open("rb") as stream, copy.open("xb") as target:
-        try:
-            for chunk in zstandard.ZstdDecompressor().read_to_iter(stream):
-                target.write(chunk)
-                if target.tell() > MOST_EXPANDED:
-                    raise InputError(f"bag {path} holds more than {MOST_EXPANDED >> 30} GiB; expected a flight")
-        except zstandard.ZstdError as error:
-            raise InputError(f"bag {path} cannot be read: {error}") from None
-    return copy
+    unpacking.copy(path, spare / path.stem)
+    return spare / path.stem
 
 
-def _uncompressed(path: Path, message: bytes) -> bytes:
-    """`message`, which a recorder may have compressed by itself, and only metadata that are lost would say so."""
-    if bytes(message[: len(COMPRESSED)]) != COMPRESSED:
-        return message
-    import zstandard
-
-    with zstandard.ZstdDecompressor().stream_reader(message) as stream:
-        found = stream.read(MOST_MESSAGE + 1)
-    if len(found) > MOST_MESSAGE:
-        raise InputError(
-            f"bag {path} holds a message of more than {MOST_MESSAGE >> 20} MiB; expected those of a flight"
-        )
-    return found
-
-
-def _whole(path: Path, spare: Path, remark: Callable[[str], None]) -> Path:
+def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Unpacking) -> Path:
     """`path`, or a copy in the folder `spare` of an MCAP file as far as it goes, if its end is missing."""
-    if path.is_dir() or path.suffix != ".mcap":
+    if path.suffix == ".db3":
+        check_tables(path)
+    if path.suffix != ".mcap":
         return path
     with path.open("rb") as stream:
         begin = stream.read(len(MAGIC))
@@ -118,8 +92,8 @@ def _whole(path: Path, spare: Path, remark: Callable[[str], None]) -> Path:
             raise InputError(f"bag {path} {what}; expected an MCAP file, which begins with {MAGIC!r}")
     if _ends(path):
         return path
-    copy = spare / path.name
-    remark(f"it is cut short, without a footer: {_copy_sound(path, copy)} messages are whole")
+    copy = spare / f"whole-{path.name}"
+    remark(f"it is cut short, without a footer: {_copy_sound(path, copy, unpacking)} messages are whole")
     return copy
 
 
@@ -131,20 +105,19 @@ def _ends(path: Path) -> bool:
         return size > len(MAGIC) and stream.read() == MAGIC
 
 
-def _copy_sound(path: Path, copy: Path) -> int:
+def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
     """Write what comes before the first damage of the MCAP file `path` to the new file `copy`; how many messages.
 
     Raises InputError: not even the header does.
     """
     from mcap.records import Channel, Header, Message, Schema
-    from mcap.stream_reader import StreamReader
     from mcap.writer import Writer
 
     count, schemas, channels, begun = 0, {0: 0}, dict[int, int](), False
     with path.open("rb") as stream, copy.open("xb") as target:
         writer = Writer(target)
         with contextlib.suppress(Exception):  # whatever a record raises that is not whole
-            for one in StreamReader(stream, validate_crcs=True).records:
+            for one in unpacking.records(stream, path.stat().st_size):
                 if isinstance(one, Header):
                     writer.start(one.profile)
                     begun = True
@@ -156,25 +129,28 @@ def _copy_sound(path: Path, copy: Path) -> int:
                 elif isinstance(one, Message):
                     writer.add_message(channels[one.channel_id], one.log_time, one.data, one.publish_time)
                     count += 1
+        unpacking.refuse()
         if not begun:
             raise InputError(f"bag {path} ends, or is damaged, within its header; expected a whole one, and messages")
         writer.finish()
     return count
 
 
-def _contents(path: Path, reader: Any) -> Found:
+def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
     topics = {one.topic: one.msgtype.replace("/msg/", "/") for one in reader.connections}
     has = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:SHOWN])
     if reader.message_count == 0:
         raise InputError(f"bag {path} is empty: it holds no message; expected those of a flight")
     if f"/{HEADER}" in topics:
         # A bag is sorted by time, and the first line may have a later one.
-        lines = [part[RECORD] for name in (HEADER, RECORD) for *_, part in _parts(path, reader, {f"/{name}"})]
+        lines = [
+            part[RECORD] for name in (HEADER, RECORD) for *_, part in _parts(path, reader, unpacking, {f"/{name}"})
+        ]
         return Found(b"".join(line + b"\n" for line in lines), {}, has)
     found: dict[tuple[str, str, str], tuple[list[float], list[Any]]] = {}
     apart: dict[str, list[float]] = {}
     wanted = {topic for topic, kind in topics.items() if (one := TOPICS.get(_last(topic))) and one.type == kind}
-    for topic, received, drone, header, values in _parts(path, reader, wanted):
+    for topic, received, drone, header, values in _parts(path, reader, unpacking, wanted):
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
         stamped = abs(received - now) <= ASTRAY * 10**9
@@ -191,12 +167,14 @@ def _last(topic: str) -> str:
     return topic.rpartition("/")[2]
 
 
-def _parts(path: Path, reader: Any, topics: set[str]) -> Iterator[tuple[str, int, str, Any, dict[str, Any]]]:
+def _parts(
+    path: Path, reader: Any, unpacking: Unpacking, topics: set[str]
+) -> Iterator[tuple[str, int, str, Any, dict[str, Any]]]:
     """(topic, time of receipt [ns], drone, header or None, values by quantity) of all messages on `topics`."""
     wanted = [one for one in reader.connections if one.topic in topics]
     for connection, received, raw in reader.messages(wanted) if wanted else ():
         topic = connection.topic
-        known, message = TOPICS[_last(topic)], reader.deserialize(_uncompressed(path, raw), connection.msgtype)
+        known, message = TOPICS[_last(topic)], reader.deserialize(unpacking.message(raw), connection.msgtype)
         try:
             parts = list(known.take(message))
         except AttributeError as error:

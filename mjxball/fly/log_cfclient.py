@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import csv
-from collections.abc import Callable
+import io
+import math
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from mjxball.errors import InputError
+from mjxball.files import read_text
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_consistency import known
 from mjxball.fly.log_sources import VARIABLES, WIDTHS, Samples, Series
 from mjxball.reading import following
+
+LARGEST, MOST_COLUMNS = 64 * 2**20, 100  # bytes of a file: some hours of a log block, whose variables fit a packet
 
 
 def read_cfclient(path: Path, remark: Callable[[str], None]) -> Series:
@@ -39,20 +44,17 @@ def _columns(folder: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
 
 
 def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
-    with contextlib.suppress(UnicodeDecodeError, csv.Error):
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            head, *rows = list(csv.reader(stream)) or [[]]
+    with contextlib.suppress(csv.Error):
+        reader = csv.reader(io.StringIO(read_text(file, "", LARGEST), newline=""))
+        head = next(reader, [])
         if head[:1] != ["Timestamp"]:
             raise InputError(f"{file} begins with {','.join(head)[:40]!r}; expected cfclient's Timestamp and variables")
+        if len(head) > MOST_COLUMNS:
+            raise InputError(f"{file} has {len(head):,} columns; expected {MOST_COLUMNS} or less, of a log block")
         if twice := [name for name in head if head.count(name) > 1]:
             raise InputError(f"{file} has two columns {twice[0]}; expected one")
-        if rows and len(rows[-1]) < len(head):
-            rows.pop()  # cfclient was ended while it wrote
         try:
-            for number, row in enumerate(rows, start=1):
-                if len(row) != len(head):
-                    raise ValueError(f"row {number} has {len(row)} values; expected {len(head)}")
-            table = np.array([[one or "nan" for one in row] for row in rows], float).reshape(-1, len(head))
+            table = np.fromiter(_numbers(reader, len(head)), float).reshape(-1, len(head))
             kept = following((1e-3 * table[:, 0]).tolist())
             if len(kept) < 2:
                 raise ValueError("it holds fewer than two rows")
@@ -65,7 +67,19 @@ def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
         except ValueError as error:
             raise InputError(f"{file} cannot be used: {error}") from None
         return {name: (time, column[:, None]) for name, column in zip(head[1:], table.T[1:], strict=True)}
-    raise InputError(f"{file} is no text in UTF-8; expected cfclient's CSV")
+    raise InputError(f"{file} is no text; expected cfclient's CSV")
+
+
+def _numbers(rows: Iterable[list[str]], width: int) -> Iterator[float]:
+    """The numbers of all `rows` but a last one that is short: cfclient was ended while it wrote. Raises ValueError."""
+    fault = ""
+    for number, row in enumerate(rows, start=1):
+        if not fault and len(row) == width:
+            yield from (float(one or math.nan) for one in row)
+            continue
+        if fault or len(row) > width:
+            raise ValueError(fault or f"row {number} has {len(row)} values; expected {width}")
+        fault = f"row {number} has {len(row)} values; expected {width}"
 
 
 def _joined(folder: Path, columns: dict[str, Samples]) -> dict[str, Samples]:

@@ -19,7 +19,7 @@ from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, Observ
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.policy.container import PolicyFileError, read_arrays
-from mjxball.reading import parse_json
+from mjxball.reading import is_number, parse_json
 
 # 5: with a GRU below the network, arrays GRU_ARRAYS; if it is told where drones are mounted, with card field `context`.
 FORMAT_VERSIONS = (1, 5)
@@ -319,7 +319,7 @@ def _check_team(team: Any, name: str) -> None:
 
 def is_finite(value: Any) -> bool:
     """Whether `value` of a card is one number within bounds, no truth value."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
+    return is_number(value, MAX_NUMBER)
 
 
 def _check_flown(flown: Any, name: str) -> None:

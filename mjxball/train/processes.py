@@ -26,6 +26,7 @@ from mjxball.train import lock
 
 HEARTBEAT = 20  # [s] after which a process that does not answer counts as dead
 PATIENCE = 120  # [s] for all processes to come together at the start
+MOST = 4096  # processes; JAX would make room for a billion
 
 
 @dataclass(frozen=True)
@@ -41,28 +42,30 @@ class Rendezvous:
             if (self.coordinator, self.processes, self.process) != (None, None, None):
                 raise InputError("--coordinator, --processes and --process belong together: give all three or none")
             return
-        port = self.coordinator.rpartition(":")[2]
-        if ":" not in self.coordinator or not port.isdecimal() or not 0 < int(port) < 65536:
+        host, _, port = self.coordinator.rpartition(":")
+        if not (host and port.isdecimal() and len(port) < 6 and 0 < int(port) < 65536):
             raise InputError(f"--coordinator must be HOST:PORT, not {self.coordinator!r}")
-        if self.processes < 1 or not 0 <= self.process < self.processes:
-            raise InputError(f"--process must be 0 .. {max(self.processes - 1, 0)}, not {self.process}")
+        if not 1 <= self.processes <= MOST:
+            raise InputError(f"--processes must be 1 .. {MOST}, not {self.processes}")
+        if not 0 <= self.process < self.processes:
+            raise InputError(f"--process must be 0 .. {self.processes - 1}, not {self.process}")
 
 
 def join(meeting: Rendezvous) -> None:
     """Join the other processes. Must come before anything else asks JAX for its devices.
 
     If they do not come together within `PATIENCE` the process says so and ends with exit code 2: JAX would abort it.
+    JAX waits outside Python, hence in a thread of its own: the main thread hears signals meanwhile.
     """
     import jax
 
-    if meeting.process == 0 and meeting.coordinator:
-        _refuse_taken(meeting.coordinator)
+    own = meeting.coordinator if meeting.process == 0 else None
+    bound = None if own is None else _bound(own)
     where = f"at {meeting.coordinator}" if meeting.coordinator else f"under {' and '.join(_surroundings())}"
-    late = threading.Timer(PATIENCE, _give_up, (where,))
-    late.daemon = True
-    late.start()
-    try:
-        with warnings.catch_warnings(action="ignore"):  # the sentence says what they would
+    failures: list[Exception] = []
+
+    def initialize() -> None:
+        try:
             jax.distributed.initialize(
                 meeting.coordinator,
                 meeting.processes,
@@ -70,13 +73,22 @@ def join(meeting: Rendezvous) -> None:
                 _only_device(),
                 initialization_timeout=10 * PATIENCE,
                 heartbeat_timeout_seconds=HEARTBEAT,
+                coordinator_bind_address=bound,
             )
-    except Exception as error:  # those of Kubernetes' client are of a kind of their own
+        except Exception as error:  # those of Kubernetes' client are of a kind of their own
+            failures.append(error)
+
+    waiting = threading.Thread(target=initialize, daemon=True)
+    with warnings.catch_warnings(action="ignore"):  # the sentence says what they would
+        waiting.start()
+        waiting.join(PATIENCE)
+    if waiting.is_alive():
+        warn(f"error: the processes did not come together {where} within {PATIENCE} s: each must reach process 0")
+        os._exit(2)  # whoever ends a thread of JAX's in another way aborts
+    for error in failures:
         why = (str(error).splitlines() or [type(error).__name__])[0][:200]
         unknown = meeting.coordinator is None and isinstance(error, ValueError)
         raise InputError(_advice() if unknown else f"the processes cannot come together {where}: {why}") from None
-    finally:
-        late.cancel()
 
 
 def _only_device() -> list[int] | None:
@@ -85,18 +97,25 @@ def _only_device() -> list[int] | None:
     return [0] if visible and "," not in visible else None
 
 
-def _refuse_taken(coordinator: str) -> None:
-    """InputError if another program listens at the port of `coordinator`, at which JAX would crash."""
-    try:
-        socket.create_server(("", int(coordinator.rpartition(":")[2]))).close()
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise InputError(f"--coordinator {coordinator}: another program of this machine has that port") from None
+def _bound(coordinator: str) -> str | None:
+    """Where process 0 listens: at `coordinator` alone, or None, on all interfaces, if that is none of this machine's.
 
-
-def _give_up(where: str) -> None:
-    warn(f"error: the processes did not come together {where} within {PATIENCE} s: each must run and reach process 0")
-    os._exit(2)  # JAX waits outside Python
+    A machine behind address translation does not have the address at which others reach it. InputError if another
+    program listens at that port, at which JAX would crash.
+    """
+    host, _, port = coordinator.rpartition(":")
+    for name, place in ((host.strip("[]"), coordinator), ("", None)):
+        family = socket.AF_INET6 if ":" in name else socket.AF_INET
+        try:
+            socket.create_server((name, int(port)), family=family).close()
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise InputError(
+                    f"--coordinator {coordinator}: another program of this machine has that port"
+                ) from None
+        else:
+            return place
+    return None
 
 
 # What each says of itself, and what makes JAX understand it.

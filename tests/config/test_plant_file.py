@@ -112,22 +112,25 @@ REFUSED = {
     ),
     "misspelt key": (RING.replace("carrier_mass", "carier_mass"), "setting (did you mean plant.carrier_mass?)"),
     "unknown table": ("[wings]\n" + RING, "not wings"),
-    "mass beyond all floats": (RING + f"mass = 1{'0' * 400}", "is not finite"),
-    "object_mass beyond all floats": (RING.replace("[plant]", f"[plant]\ngravity = 1{'0' * 400}", 1), "is not finite"),
+    "mass beyond all floats": (RING + f"mass = 1{'0' * 400}", "a whole number has 401 digits"),
+    "object_mass beyond all floats": (
+        RING.replace("[plant]", f"[plant]\ngravity = 1{'0' * 400}", 1),
+        "a whole number has 401 digits",
+    ),
     "unknown key of a drone": (RING + "weight = 1.0", "unknown weight"),
     "drones in one place": (RING.replace("[-0.1, -0.17, 0.0]", "[-0.1, 0.17, 0.0]"), "the same place"),
     "one drone": ("[[plant.drones]]\nmass = 1.0", "2 to 16 drones"),
     "drones that are none": ("[plant]\ndrones = [1, 2]", "a list of tables"),
     "a mount out of reach": (RING.replace("[0.2, 0.0, 0.0]", "[20.0, 0.0, 0.0]"), "drones.0.mount lies beyond 10 m"),
     "a flat mount": (RING.replace("[0.2, 0.0, 0.0]", "[0.2, 0.0]"), "drones.0.mount takes 3 numbers"),
-    "singular inertia": (RING + "inertia = [0.0, 1e-3, 1e-3]", "drones.2.inertia must be greater than 0"),
+    "singular inertia": (RING + "inertia = [0.0, 1e-3, 1e-3]", "drones.2.inertia must be between"),
     "inertia of no body": (
         RING + "inertia = [1e-3, 1e-3, 5e-3]",
         "drones.2.inertia (0.001, 0.001, 0.005) is that of",
     ),
     "singular carrier": (RING.replace("[1e-3, 1e-3, 2e-3]", "[0.0, 0.0, 0.0]"), "is singular"),
-    "negative mass": (RING + "mass = -1.0", "drones.2.mass must be greater than 0"),
-    "mass is not a number": (RING + "mass = nan", "drones.2.mass must be finite"),
+    "negative mass": (RING + "mass = -1.0", "drones.2.mass must be between"),
+    "mass is not a number": (RING + "mass = nan", "drones.2.mass must be between"),
     "mass is a word": (RING + 'mass = "heavy"', "drones.2.mass takes numbers"),
     "object_mass is a word": (RING.replace("[plant]", '[plant]\nobject_mass = "0.3"', 1), "object_mass takes numbers"),
     "ten thousand drones": (RING + "[[plant.drones]]\nmount = [0.1, 0.1, 0.0]\n" * 10_000, "is larger than 64 KiB"),
@@ -141,8 +144,8 @@ REFUSED = {
     ),
     "a Crazyflie that is turned": ('base = "crazyflie"\n[plant.drones.1]\nyaw = 0.5', "no yaw"),
     "nobody leads": (RING.replace("[plant]", "[plant]\nleader = 3", 1), "none of the 3 drones"),
-    "a mount that is no number": (RING.replace("[0.2, 0.0, 0.0]", "[nan, 0.0, 0.0]"), "drones.0.mount must be finite"),
-    "negative rotors": (RING + "rotor_force_max = -8.0", "drones.2.rotor_force_max must be at least 0"),
+    "a mount that is no number": (RING.replace("[0.2, 0.0, 0.0]", "[nan, 0.0, 0.0]"), "drones.0.mount must be between"),
+    "negative rotors": (RING + "rotor_force_max = -8.0", "drones.2.rotor_force_max must be between"),
 }
 
 
@@ -191,8 +194,7 @@ def test_no_number_of_a_plant_may_be_none_or_endless_or_below_its_bound() -> Non
     for path, value, item in configs.leaves(team.plant):
         if isinstance(value, (str, int)) and not isinstance(value, float):
             continue
-        bound = item.metadata["above"] if item.metadata["above"] is not None else item.metadata["low"]
-        for wrong in (math.nan, math.inf, *(() if bound is None else (bound - 1.0,))):
+        for wrong in (math.nan, math.inf, item.metadata["low"] - 1.0):
             changed = (wrong,) * len(value) if isinstance(value, tuple) else wrong
             with pytest.raises(InputError, match=path.rpartition(".")[2]):
                 configs.validate(configs.replace(team, f"plant.{path}", changed))

@@ -172,7 +172,9 @@ def test_every_process_can_trace_mjx() -> None:
         (("127.0.0.1:99999", 2, 0), "HOST:PORT"),
         (("127.0.0.1:\N{SUPERSCRIPT TWO}", 2, 0), "HOST:PORT"),
         (("127.0.0.1:1234", 2, 2), "0 .. 1"),
-        (("127.0.0.1:1234", 0, 0), "--process"),
+        (("127.0.0.1:1234", 0, 0), "--processes must be 1 .. 4096, not 0"),
+        (("127.0.0.1:1234", 10**9, 0), "--processes must be 1 .. 4096, not 1000000000"),
+        ((":1234", 2, 0), "HOST:PORT"),
     ],
 )
 def test_unsound_meetings_are_refused(meeting, word) -> None:
@@ -212,7 +214,8 @@ MEET = """
 import sys
 from mjxball import cli
 from mjxball.train import processes
-processes.PATIENCE = 2
+cli.quit_on_interrupt()
+processes.PATIENCE = {patience}
 sys.exit(cli.run_command(lambda: processes.join(processes.Rendezvous({place!r}, 2, {process}))))
 """
 
@@ -222,7 +225,55 @@ sys.exit(cli.run_command(lambda: processes.join(processes.Rendezvous({place!r}, 
 def test_a_process_that_meets_nobody_says_so(process: int) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         place = f"127.0.0.1:{free.getsockname()[1]}"
-    assert f"did not come together at {place} within 2 s" in refusal(MEET.format(place=place, process=process))
+    assert f"did not come together at {place} within 2 s" in refusal(
+        MEET.format(place=place, process=process, patience=2)
+    )
+
+
+def listeners(port: int) -> set[str]:
+    """Addresses as the kernel writes them, at which somebody of this machine listens on `port`."""
+    lines = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()]
+    places = [place.rpartition(":") for _, place, _, state, *_ in lines if state == "0A"]
+    return {address for address, _, own in places if own == f"{port:04X}"}
+
+
+@pytest.mark.slow
+def test_who_waits_for_the_others_listens_where_it_was_told_and_hears_signals() -> None:
+    waiting = []
+    for host, told in (("localhost", signal.SIGINT), ("127.0.0.1", signal.SIGTERM)):
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        code = MEET.format(place=f"{host}:{port}", process=0, patience=LIMIT)
+        waiting.append((port, told, subprocess.Popen([sys.executable, "-c", code], env=environment())))
+    try:
+        for port, told, child in waiting:
+            deadline = time.monotonic() + LIMIT
+            while not (found := listeners(port)) and child.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.05)
+            assert found <= {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}, found
+            assert found
+            child.send_signal(told)
+            assert child.wait(timeout=LIMIT / 4) == (130 if told == signal.SIGINT else -told)
+    finally:
+        for _, _, child in waiting:
+            child.kill()
+
+
+def test_where_process_0_listens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the address that it is given, if it is one of this machine's: `192.0.2.1` is nobody's (RFC 5737)."""
+    given: list[Any] = []
+    monkeypatch.setattr(
+        "jax.distributed.initialize", lambda *_, **named: given.append(named["coordinator_bind_address"])
+    )
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    for place, process, expected in (
+        (f"127.0.0.1:{port}", 0, f"127.0.0.1:{port}"),
+        (f"192.0.2.1:{port}", 0, None),
+        (f"127.0.0.1:{port}", 1, None),
+    ):
+        join(Rendezvous(place, 2, process))
+        assert given[-1] == expected, place
 
 
 def test_a_taken_port_is_refused() -> None:

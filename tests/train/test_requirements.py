@@ -26,13 +26,13 @@ from mjxball.xla import explained
 
 PHYSICS = ["--physics", "newton-euler"]
 TOO_MUCH: list[tuple[list[Any], str]] = [
-    (["--algorithm", "gradient", "--gradient.num_envs", 10**11], "at least .* GB|environment steps"),
+    (["--algorithm", "gradient", "--gradient.num_envs", 10**11], "at least .* GB|environment steps|must be between"),
     (["--algorithm", "gradient", "--gradient.num_envs", 10**6, "--gradient.gradient_steps", 1], "GB are free"),
     (["--algorithm", "ppo", "--ppo.num_envs", 10**11, "--ppo.minibatches", 8], "at least"),
     (["--sac.policy_layers", 10**11], "GB are free"),
     (["--sac.critic_layers", "1000000,1000000"], "GB are free"),
     (["--sac.replay_size", 128 * 10**9], "GB are free"),
-    (["--follower.recurrent_units", 10**8], "recurrent_units must be at most 512"),
+    (["--follower.recurrent_units", 10**8], "recurrent_units must be between 0 and 512"),
     (["--follower.recurrent_units", 512, "--num-seeds", 1024], "GB are free"),
     (["--num-seeds", 4096], "GB are free"),
     (["--sac.total_steps", 10**12], "environment steps"),

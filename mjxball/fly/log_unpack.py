@@ -1,0 +1,126 @@
+"""What a bag unpacks to, bounded: the libraries that read it believe its sizes, and some kilobytes may be gigabytes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mjxball.errors import InputError
+
+TIMES, ALWAYS, DISK = 100, 16 * 2**20, 2**32  # of a bag's own size; [bytes] whatever its size; [bytes] of copies
+PACKED = b"\x28\xb5\x2f\xfd"  # with which what zstd compressed begins
+PIECE = 2**20  # [bytes] unpacked at once
+
+Unpack = Callable[[bytes], bytes]
+
+
+class Unpacking:
+    """Counts what the bag `path` of `size` bytes unpacks to, in all its chunks, messages and files."""
+
+    def __init__(self, path: Path, size: int):
+        self._path, self._limit = path, max(ALWAYS, TIMES * size)
+        self._left, self._copied = self._limit, 0
+
+    def refuse(self) -> None:
+        """Raise InputError if it was too much, as whatever unpacks does at once."""
+        if self._left < 0 or self._copied > DISK:
+            most = min(self._limit, DISK) if self._copied > DISK else self._limit
+            raise InputError(
+                f"bag {self._path} unpacks to more than {most >> 20} MiB; expected at most {TIMES} times its own size, "
+                f"or {ALWAYS >> 20} MiB"
+            )
+
+    def plain(self, data: bytes) -> bytes:
+        """`data`, counted."""
+        self._left -= len(data)
+        self.refuse()
+        return data
+
+    def zstd(self, data: bytes) -> bytes:
+        """What is in the frames `data`."""
+        return b"".join(self._pieces(io.BytesIO(data)))
+
+    def message(self, data: bytes) -> bytes:
+        """`data`, or what is in it if the recorder compressed it by itself, as no message in CDR begins."""
+        return self.zstd(data) if data[: len(PACKED)] == PACKED else data
+
+    def lz4(self, data: bytes) -> bytes:
+        """What is in the frame `data`. Raises ValueError if it is not whole."""
+        import lz4.frame
+
+        frame, parts = lz4.frame.LZ4FrameDecompressor(), list[bytes]()
+        while not frame.eof:
+            parts.append(self.plain(frame.decompress(data, max_length=PIECE)))
+            data = b""
+            if frame.needs_input and not parts[-1]:
+                raise ValueError("a chunk is cut short")
+        return b"".join(parts)
+
+    def copy(self, source: Path, target: Path) -> None:
+        """Write what the file `source` was compressed from to the new file `target`."""
+        with source.open("rb") as packed, target.open("xb") as stream:
+            for piece in self._pieces(packed):
+                self._copied += stream.write(piece)
+                self.refuse()
+
+    def records(self, stream: BinaryIO, size: int) -> Iterator[Any]:
+        """Records of the MCAP file `stream` of `size` bytes, and those in its chunks; what `mcap` raises."""
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader, breakup_chunk
+
+        for record in StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records:
+            if isinstance(record, Chunk):
+                data = self._by_name()[record.compression](record.data)
+                yield from breakup_chunk(dataclasses.replace(record, compression="", data=data), validate_crc=True)
+            else:
+                yield record
+
+    @contextlib.contextmanager
+    def bounding(self) -> Iterator[None]:
+        """Chunks that rosbags unpacks are counted meanwhile; it has no bound of its own, nor a way to be told one."""
+        from rosbags.rosbag2 import storage_mcap
+
+        kept = storage_mcap.DECOMPRESSORS
+        storage_mcap.DECOMPRESSORS = {name: _sized(unpack) for name, unpack in self._by_name().items()}
+        try:
+            yield
+        finally:
+            storage_mcap.DECOMPRESSORS = kept
+
+    def _by_name(self) -> dict[str, Unpack]:
+        """What unpacks a chunk, by the name of its compression."""
+        return {"": self.plain, "zstd": self.zstd, "lz4": self.lz4}
+
+    def _pieces(self, packed: Any) -> Iterator[bytes]:
+        import zstandard
+
+        with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True, closefd=False) as stream:
+            while piece := stream.read(PIECE):
+                yield self.plain(piece)
+
+
+def _sized(unpack: Unpack) -> Callable[[bytes, int], bytes]:
+    """As rosbags calls it, with the size that a chunk says of itself."""
+    return lambda data, _: unpack(data)
+
+
+def check_tables(path: Path) -> None:
+    """Raise InputError unless the SQLite file `path` holds tables of what is stored, and no recipes for more."""
+    with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as base:
+        try:
+            found = base.execute(
+                "SELECT type, lower(sql) FROM sqlite_master WHERE type IN ('view', 'table')"
+            ).fetchall()
+            computed = [sql for kind, sql in found if kind == "view" or " virtual " in sql or " as " in sql]
+            if not computed:
+                return
+        except (sqlite3.Error, TypeError) as error:
+            raise InputError(f"bag {path} cannot be read: {error}") from None
+    raise InputError(
+        f"bag {path} computes what it holds, by {computed[0][:60]!r}; expected tables as rosbag2 writes them"
+    )
