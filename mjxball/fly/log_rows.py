@@ -35,22 +35,25 @@ def sound(path: Path, own: Drone, name: str, remark: Callable[[str], None]) -> D
     a series is too long, or velocities do not agree with the poses.
     """
     found: Drone = {}
+    missing: dict[str, list[str]] = {}
     for quantity, (time, rows) in own.items():
         good = _sound_rows(quantity, time, rows)
         lost = len(time) - int(good.sum())
-        what = f"{called(quantity)} of {name}"
+        of_drone = f"{called(quantity)} of {name}"
         if len(time) - lost < 2 or (quantity in USUAL and not rows[good].any()):
             if quantity in NEEDED:
-                has = f"{what} has {len(time) - lost} good rows of {len(time)}"
+                has = f"{of_drone} has {len(time) - lost} good rows of {len(time)}"
                 raise InputError(f"{path}: {has}; expected two or more, of {EXPECTED[quantity]}")
             continue  # as are those that nobody measured, which are zeros
         if lost:
-            when = f"first {time[~good][0] - time[0]:.2f} s after its beginning"
-            remark(f"{what} is missing in {lost} of {len(time)} rows, {when}")
+            where = f"{lost} of {len(time)} rows, first {time[~good][0] - time[0]:.2f} s after its beginning"
+            missing.setdefault(where, []).append(called(quantity))
         found[quantity] = time[good], rows[good]
         if (span := float(np.ptp(time[good]))) > LONGEST:
-            raise InputError(f"{path}: {what} goes on for {span:.3g} s; expected {LONGEST:g} s or less")
-    for quantity in USUAL.keys() & found.keys():
+            raise InputError(f"{path}: {of_drone} goes on for {span:.3g} s; expected {LONGEST:g} s or less")
+    for where, quantities in missing.items():
+        remark(f"{name} has no {', '.join(quantities)} in {where}")
+    for quantity in [one for one in USUAL if one in found]:
         found[quantity] = _in_axes(path, found, quantity, name, remark)
     return found
 

@@ -77,15 +77,11 @@ def make_log(
         raise ValueError("shapes do not fit: time (T,), setpoints (T, 2, 4), states (T, 2, 13)")
     if min(count, *map(len, times)) < 2:
         raise ValueError("it holds fewer than two rows")
-    kept = {
-        name: _sound_rows(name, t, rows)
-        for name, t, rows in zip(("setpoints", *NAMES), (sent_at, *times), (setpoints, *states), strict=True)
-    }
-    lost = {name: len(t) - len(kept[name]) for name, t in zip(kept, (sent_at, *times), strict=True)}
-    sent_at, setpoints = sent_at[kept["setpoints"]], setpoints[kept["setpoints"]]
-    guided = None if guided is None else guided[kept["setpoints"]]
-    times = [t[kept[name]] for name, t in zip(NAMES, times, strict=True)]
-    states = [rows[kept[name]] for name, rows in zip(NAMES, states, strict=True)]
+    kept, remarks = _kept((sent_at, *times), (setpoints, *states))
+    sent_at, setpoints = sent_at[kept[0]], setpoints[kept[0]]
+    guided = None if guided is None else guided[kept[0]]
+    times = [t[own] for t, own in zip(times, kept[1:], strict=True)]
+    states = [rows[own] for rows, own in zip(states, kept[1:], strict=True)]
     flown = slice(None) if guided is None else guided
     for fault in faults((sent_at[flown], setpoints[flown]), list(zip(times, states, strict=True))):
         raise ValueError(fault)
@@ -99,24 +95,31 @@ def make_log(
         height = np.mean([np.interp(grid, t, s[:, 2] - s[0, 2]) for t, s in zip(times, states, strict=True)], axis=0)
         usable &= guided[latest] & (height > OFF_THE_GROUND)
     found = [gap for name, t, s in zip(NAMES, times, states, strict=True) for gap in outages(name, t, s, t[-1])]
-    remarks = tuple(f"{rows} rows of its {name} are missing" for name, rows in lost.items() if rows)
     return Log(setpoints[latest], climb, euler, rates, usable & ~_within(grid, found), every, remarks)
 
 
-def _sound_rows(name: str, time: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n,) numbers of the rows that are whole, in the order of time. Raises ValueError."""
-    sound = np.isfinite(time) & np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
-    if name in NAMES:
-        sound &= np.abs(np.linalg.norm(rows[:, 6:10], axis=1) - 1) <= UNEVEN
-    found = np.flatnonzero(sound)
-    if len(found) < 2:
-        raise ValueError("numbers are missing or not finite")
-    try:
-        found = found[following(time[found].tolist())]
-        check_times(time[found].tolist(), *STEPS)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
-    return found
+def _kept(times: Sequence[np.ndarray], series: Sequence[np.ndarray]) -> tuple[list[np.ndarray], tuple[str, ...]]:
+    """Of setpoints and both drones' states the rows that are whole, in the order of time, and what is missing.
+
+    Raises ValueError if too little is left.
+    """
+    kept, remarks = [], []
+    for name, time, rows in zip(("setpoints", *NAMES), times, series, strict=True):
+        whole = np.isfinite(time) & np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+        if name in NAMES:
+            whole &= np.abs(np.linalg.norm(rows[:, 6:10], axis=1) - 1) <= UNEVEN
+        found = np.flatnonzero(whole)
+        if len(found) < 2:
+            raise ValueError("numbers are missing or not finite")
+        try:
+            found = found[following(time[found].tolist())]
+            check_times(time[found].tolist(), *STEPS)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        if lost := len(time) - len(found):
+            remarks.append(f"{lost} rows of its {name} are missing")
+        kept.append(found)
+    return kept, tuple(remarks)
 
 
 def _on_grid(grid: np.ndarray, time: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
