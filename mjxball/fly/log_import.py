@@ -184,9 +184,8 @@ def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[
 
 def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent: list[Samples]) -> list[Record]:
     """A header, states, and a tick for each of the leader's setpoints once the follower has one; laws fly it all."""
-    begin = min(own[0][0] for own in states)
     header = {"schema": SCHEMA, "policy": UNKNOWN, "config": config, "gains": pair_gains(config.autopilot)}
-    found: list[Record] = [{"t": begin, "kind": "header", **header}]
+    found: list[Record] = []
     for name, own in zip(NAMES, states, strict=True):
         found += [{"t": now, "kind": "state", "drone": name, "raw": StatePacket(0, state)} for now, state in own]
     (times, leader), (others, follower) = sent
@@ -197,4 +196,5 @@ def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent:
         state = State.FLY if (setpoints[:, 3] > 0).all() else State.DONE
         found.append({"t": float(now), "kind": "tick", "state": state.value, "goal": goal, "sent": setpoints})
     found.sort(key=lambda one: float(one["t"]))
-    return [*found, {"t": found[-1]["t"], "kind": "end", "code": 0}]
+    first, last = found[0]["t"], found[-1]["t"]
+    return [{"t": first, "kind": "header", **header}, *found, {"t": last, "kind": "end", "code": 0}]

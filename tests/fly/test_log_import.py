@@ -275,6 +275,7 @@ def test_messages_without_a_stamp_are_missing(sqlite: bool, tmp_path: Path) -> N
             tmp_path / str(begin), records, odometry=True, sqlite=sqlite, unstamped=range(begin, begin + 9)
         )
         assert len(states_of(path, told)) == 177
+        assert len(read_recording(path).time) == 180 - 3 * (begin == 0)
         lost = "position, quaternion, velocity, body rate, battery in 3 of 180 rows"
         assert f"cf231 has no {lost}, first {begin / 300:.2f} s after" in " ".join(told)
     path = write_bag(tmp_path / "none", records, odometry=True, sqlite=sqlite, unstamped=range(540))
