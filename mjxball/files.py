@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
 import stat
@@ -45,11 +46,20 @@ def read_bytes(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BY
 
 
 def read_text(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BYTES) -> str:
-    """The same of a text in UTF-8, with line ends as they are."""
+    """The same of a text in UTF-8, with line ends as they are, without the byte order mark that some editors write."""
+    content = read_bytes(path, kind, limit)
+    called = f"{kind}{' ' if kind else ''}{path}"
+    if is_utf16(content):
+        raise InputError(f"{called} cannot be read: it is UTF-16; save it as UTF-8")
     try:
-        return read_bytes(path, kind, limit).decode()
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{kind}{' ' if kind else ''}{path} cannot be read: it is not UTF-8, {error.reason}") from None
+        raise InputError(f"{called} cannot be read: it is not UTF-8, {error.reason}") from None
+
+
+def is_utf16(content: bytes) -> bool:
+    """Whether `content` begins as a text in UTF-16 or UTF-32, with their byte order mark, does."""
+    return content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE))
 
 
 def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:

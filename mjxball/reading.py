@@ -5,6 +5,7 @@ Standard library only.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import json
 import math
@@ -15,6 +16,7 @@ from typing import Any, TypeGuard
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
 GAP = 5.0  # steps from which on a recording has a hole
+STRAY = 0.1  # share of rows whose time may not follow
 LARGEST, SMALLEST = 1e12, 1e-30  # sizes of a number that is not 0: products of others are endless or 0 in float32
 MOST_DIGITS = 20  # of a whole number, which 64 bits hold; Python would take thousands, and no float does
 
@@ -76,6 +78,28 @@ def time_fault(before: float, after: float) -> str | None:
     if after < before:
         return f"the time goes back by {before - after:.3g} s"
     return "a time stands twice" if after == before else None
+
+
+def following(times: Sequence[float]) -> list[int]:
+    """Numbers of the most rows whose `times` [s] increase; the others' times are how some writers say "missing".
+
+    Raises ValueError with a phrase if more than a tenth are others: nothing says when the rest happened.
+    """
+    ends: list[float] = []  # of series of one row, of two, and so on, the earliest
+    rows: list[int] = []  # at these ends
+    before: list[int] = []  # each row's
+    for number, now in enumerate(times):
+        place = bisect.bisect_left(ends, now) if math.isfinite(now) else 0
+        before.append(rows[place - 1] if place else -1)
+        if math.isfinite(now) and (place == len(ends) or now < ends[place]):
+            ends[place : place + 1], rows[place : place + 1] = [now], [number]
+    found, last = [], rows[-1] if rows else -1
+    while last >= 0:
+        found.append(last)
+        last = before[last]
+    if len(times) - len(found) > STRAY * len(times):
+        check_times(times)
+    return found[::-1]
 
 
 def check_times(times: Sequence[float], shortest: float = 0.0, longest: float = math.inf) -> list[str]:

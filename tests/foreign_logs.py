@@ -6,7 +6,7 @@ Types, topics and signs are those of Crazyswarm2's server in C++ and of cfclient
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,16 @@ def write_bag(
     commands: bool = True,
     late: int = 0,
     rates: Callable[[int], int] = lambda number: 3,
+    unstamped: Collection[int] = (),
+    compression: str = "",
+    spin: bool = False,
 ) -> Path:
     """The new folder `path` of a bag: poses or `odometry`, rates, battery and setpoints; received `late` [ns].
 
-    Message `number` of `odometry`'s rates has `rates(number)` values.
+    Message `number` of `odometry`'s rates has `rates(number)` values; with `spin` the odometry has the rates. Records
+    whose numbers are `unstamped` have stamps of 0. `compression` is that of each message or of the file.
     """
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -47,7 +51,10 @@ def write_bag(
         return store.types[name.replace("/", "/msg/")](*fields)
 
     channels: dict[str, Any] = {}
-    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP) as writer:
+    whole = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP)
+    if compression:
+        whole.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with whole as writer:
 
         def put(topic: str, time: int, message: Any) -> None:
             kind = message.__msgtype__
@@ -57,7 +64,7 @@ def write_bag(
 
         for number, record in enumerate(records):
             time = START + round(record["t"] * 1e9)
-            stamp = make("builtin_interfaces/Time", *divmod(time, 10**9))
+            stamp = make("builtin_interfaces/Time", *divmod(0 if number in unstamped else time, 10**9))
             header = make("std_msgs/Header", stamp, "world")
             if record["kind"] == "tick" and commands:
                 for drone, (roll, pitch, yaw_rate, thrust) in zip(names.values(), record["sent"], strict=True):
@@ -71,13 +78,15 @@ def write_bag(
             turned = make("geometry_msgs/Quaternion", *xyz, w)
             placed = make("geometry_msgs/Pose", make("geometry_msgs/Point", *state.position), turned)
             if odometry:
-                still = make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-                moving = make("geometry_msgs/Twist", make("geometry_msgs/Vector3", *state.velocity), still)
+                turning = make("geometry_msgs/Vector3", *(state.rates if spin else np.zeros(3)))
+                moving = make("geometry_msgs/Twist", make("geometry_msgs/Vector3", *state.velocity), turning)
                 parts = (
                     make("geometry_msgs/PoseWithCovariance", placed, np.zeros(36)),
                     make("geometry_msgs/TwistWithCovariance", moving, np.zeros(36)),
                 )
                 put(f"/{drone}/odom", time, make("nav_msgs/Odometry", header, drone, *parts))
+                if spin:
+                    continue
                 values = np.resize(np.degrees(state.rates), rates(number)).astype(np.float32)
                 put(f"/{drone}/gyro", time, make("crazyflie_interfaces/LogDataGeneric", header, 0, values))
                 put(f"/{drone}/status", time, make("crazyflie_interfaces/Status", header, 0, state.battery, 0))

@@ -12,15 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY
+from fly_policies import untrained
+from fly_virtual import log_header
+from models import DRONE
 from tables import rows
 
 from mjxball import config as configs
 from mjxball.config import preset, read_plant
+from mjxball.config._model import read_model
 from mjxball.errors import InputError
 from mjxball.evaluate.scenarios import read_waveform
+from mjxball.fly import flight_log
+from mjxball.fly.crazyswarm import read_pair
+from mjxball.fly.flight_log import Journal
 from mjxball.fly.preflight import read_gains
 from mjxball.policy.file import load_file, shipped_policy
-from mjxball.reading import check_times, is_number, parse_json, parse_toml
+from mjxball.reading import check_times, following, is_number, parse_json, parse_toml
 from mjxball.train.curves import training_curve
 from mjxball.train.progress import COMMON, Progress
 from mjxball.train.run_directory import read_config, read_rows, read_sweep, write_config
@@ -89,6 +96,57 @@ def card_of(place: Path) -> None:
 def test_every_file_with_a_key_twice_is_refused(read: Callable[[Path], None], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="stands twice"):
         read(tmp_path)
+
+
+def readers(place: Path) -> dict[str, tuple[str, Callable[[Path], Any]]]:
+    """By file name what is in it, and what reads it."""
+    write_config(place, preset("transport"), {"seed": 0, "physics": "mjx", "seeds": 1, "sweep": None})
+    with Journal(place / "log.jsonl", **log_header(untrained("flight"))) as log:
+        log.note("end", code=0)
+    robot = "    enabled: true\n    type: cf21\n    uri: radio://0/80/2M/E7E7E7E70"
+    robots = f"robot_types:\n  cf21: {{}}\nrobots:\n  leader:\n{robot}1\n  follower:\n{robot}2\n"
+    return {
+        "plant.json": ('{"plant.object_mass": 0.2}\n', read_plant),
+        "plant.toml": ("[plant]\nobject_mass = 0.2\n", read_plant),
+        "gains.json": ('{"pid_rate.roll_kp": 250}\n', read_gains),
+        "cg.csv": ("0,0\n1,0.01\n2,0\n3,0\n", read_waveform),
+        "robots.yaml": (robots, lambda path: repr(read_pair(path))),
+        "model.xml": (DRONE.replace("><", ">\n<"), lambda path: repr(read_model(path))),
+        "sweep.json": ('{"sac.alpha": [0.1, 0.2]}\n', lambda path: read_sweep(path, 2, preset("transport"))),
+        "metrics.csv": ("steps,reward\n1,2\n", read_rows),
+        "config.json": ((place / "config.json").read_text(), lambda path: repr(read_config(path.parent))),
+        "log.jsonl": ((place / "log.jsonl").read_text(), lambda path: [one["t"] for one in flight_log.read(path)]),
+    }
+
+
+def test_every_text_is_read_with_a_byte_order_mark_and_other_line_ends(tmp_path: Path) -> None:
+    """As editors on Windows write them; one in UTF-16 is called so."""
+    for name, (text, read) in readers(tmp_path).items():
+        path = tmp_path / name
+        found = []
+        for content in (text, "\ufeff" + text, text.replace("\n", "\r\n"), "\ufeff" + text.replace("\n", "\r\n")):
+            path.write_bytes(content.encode())
+            found.append(read(path))
+        assert all(one == found[0] for one in found), name
+        for code in ("utf-16", "utf-16-be"):
+            path.write_bytes(("\ufeff" * (code == "utf-16-be") + text).encode(code))
+            with pytest.raises(InputError, match="it is UTF-16; save it as UTF-8"):
+                read(path)
+
+
+def test_rows_whose_time_does_not_follow_are_left_out() -> None:
+    even = [0.01 * number for number in range(100)]
+    assert following(even) == [*range(100)]
+    for times, lost in (
+        ([*even[:50], 0.0, 0.0, 0.0, *even[53:]], {50, 51, 52}),
+        ([*even[:50], 1e9, 1e9, *even[52:]], {50, 51}),
+        ([*even[:50], math.nan, math.inf, *even[52:]], {50, 51}),
+        ([*even[:50], even[49], *even[51:]], {50}),
+    ):
+        assert set(range(100)) - {*following(times)} == lost
+    for times in ([*even[:50], *even[:50]], [0.0] * 9, [math.nan] * 9):
+        with pytest.raises(ValueError, match=r"row \d+: (the time goes back|a time stands twice|a time is not finite)"):
+            following(times)
 
 
 def test_times_that_do_not_run_forward_are_refused() -> None:

@@ -23,7 +23,7 @@ MAX_ELEMENTS = 5000  # of XML; MuJoCo takes seconds for more
 MAX_PIXELS = 2**22  # of all height fields and textures of a model
 UNEXPANDED = "it is a xacro file, expand it with xacro first: xacro FILE.xacro > FILE.urdf"
 LONGEST = 200  # characters of a name or a message that a sentence shows
-FIRST = re.compile(r"\ufeff?(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
+FIRST = re.compile(r"(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 COUNTS = re.compile(r"count|nrow|ncol|nsample|nkey|nuser\w*")  # attributes: how many there are
 FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; URDF's shapes do not matter
@@ -142,7 +142,7 @@ class _Check:
         parser.StartElementHandler, parser.EndElementHandler = self._begin, lambda name: self.times.pop()
         try:
             # MuJoCo allows -- in a comment, and blanks before the declaration.
-            parser.Parse(COMMENT.sub("", text).lstrip("\ufeff \t\r\n"), True)
+            parser.Parse(COMMENT.sub("", text).lstrip(" \t\r\n"), True)
         except expat.ExpatError as error:
             raise InputError(f"it is no well-formed XML: {error}") from None
 

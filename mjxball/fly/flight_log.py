@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.files import is_utf16
 from mjxball.fly import clock, log_import
 from mjxball.fly.log_schema import SCHEMA, Record, decode
 from mjxball.fly.setpoints import CURVE_NAMES
@@ -167,6 +168,8 @@ class Tail:
             raw = None
         sound = isinstance(raw, dict) and "t" in raw and "kind" in raw
         if not self._begun:
+            if is_utf16(line):
+                raise InputError(f"{self.path} is not a flight log: it is UTF-16; save it as UTF-8")
             return self._header(raw if sound else {})
         try:
             if not sound:

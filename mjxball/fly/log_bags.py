@@ -16,7 +16,8 @@ from mjxball.fly.log_unpack import Unpacking, check_tables
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 BAGS, COMPRESSED = (".mcap", ".db3"), ".zstd"
-CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ
+CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ as a rule
+ASTRAY = 1  # [s] by which one of them may: a stamp of 0 says that the message is of no time
 SHOWN = 6  # topics that a sentence names
 
 
@@ -50,6 +51,11 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
             raise InputError(f"bag {path} cannot be read: {said(error)}") from None
 
 
+def is_bag(path: Path) -> bool:
+    """Whether `path` is called as a bag's file is, compressed or not."""
+    return path.name.removesuffix(COMPRESSED).endswith(BAGS)
+
+
 def _files(path: Path) -> list[Path]:
     """The bag `path` itself, or the files of a folder; they hold all that its metadata.yaml says."""
     if path.is_file():
@@ -58,7 +64,7 @@ def _files(path: Path) -> list[Path]:
     if odd := [one for one in inside if one.exists() and not one.is_file() and not one.is_dir()]:
         raise InputError(f"bag {odd[0]} is no regular file")
     files = [one for one in path.iterdir() if one.is_file()] if path.is_dir() else []
-    found = sorted(one for one in files if one.name.removesuffix(COMPRESSED).endswith(BAGS))
+    found = sorted(filter(is_bag, files))
     if not found:
         what = "is a folder without .mcap or .db3" if path.exists() else "does not exist"
         raise InputError(f"bag {path} {what}; expected a rosbag2 file or folder, or cfclient's leader and follower")
@@ -147,11 +153,12 @@ def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
     for topic, received, drone, header, values in _parts(path, reader, unpacking, wanted):
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
+        stamped = abs(received - now) <= ASTRAY * 10**9
         for quantity, numbers in values.items():
             _check_width(path, topic, quantity, len(numbers))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
-            times.append((now - reader.start_time) * 1e-9)
-            rows.append(numbers)
+            times.append(((now if stamped else received) - reader.start_time) * 1e-9)
+            rows.append(numbers if stamped else (np.nan,) * len(numbers))
     _check_clocks(path, apart)
     return Found(b"", _densest(found), has)
 
@@ -196,9 +203,14 @@ def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:
 
 
 def _densest(found: dict[tuple[str, str, str], tuple[list[float], list[Any]]]) -> Series:
-    """Of several topics for one quantity of a drone that with the most messages, in the order of time."""
+    """Of several topics for one quantity of a drone that with the most messages, in the order of time.
+
+    One of zeros, which nobody measured, comes last.
+    """
     series: Series = {}
-    for (drone, quantity, _), (times, rows) in sorted(found.items(), key=lambda item: len(item[1][0])):
+    for (drone, quantity, _), (times, rows) in sorted(
+        found.items(), key=lambda one: (np.any(one[1][1]), len(one[1][0]))
+    ):
         order, first = np.unique(np.array(times), return_index=True)
         series.setdefault(drone, {})[quantity] = order, np.array(rows, float)[first]
     return series

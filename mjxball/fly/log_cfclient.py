@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,34 +14,36 @@ import numpy as np
 from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.fly.limits import NAMES
+from mjxball.fly.log_consistency import known
 from mjxball.fly.log_sources import VARIABLES, WIDTHS, Samples, Series
-from mjxball.reading import check_times
+from mjxball.reading import following
 
 LARGEST, MOST_COLUMNS = 64 * 2**20, 100  # bytes of a file: some hours of a log block, whose variables fit a packet
 
 
-def read_cfclient(path: Path) -> Series:
+def read_cfclient(path: Path, remark: Callable[[str], None]) -> Series:
     """The folder `path` with the folders `leader` and `follower` of CSV files that cfclient wrote.
 
-    The times of each drone are those of its own clock. Raises InputError: there are none, or they are damaged.
+    The times of each drone are those of its own clock; a number that is not there is NaN. Raises InputError: there are
+    none, or they are damaged.
     """
-    return {name: _joined(path / name, _columns(path / name)) for name in NAMES}
+    return {name: _joined(path / name, _columns(path / name, remark)) for name in NAMES}
 
 
-def _columns(folder: Path) -> dict[str, Samples]:
+def _columns(folder: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
     files = sorted(file for file in folder.glob("*.csv") if file.is_file())
     if not files:
         raise InputError(f"{folder} holds no .csv; expected the files that cfclient wrote of this drone")
     found: dict[str, Samples] = {}
     for file in files:
-        own = _read_csv(file)
+        own = _read_csv(file, remark)
         if twice := sorted(own.keys() & found.keys()):
             raise InputError(f"{twice[0]} stands in {file} and in another file of {folder}; expected one recording")
         found |= own
     return found
 
 
-def _read_csv(file: Path) -> dict[str, Samples]:
+def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
     with contextlib.suppress(csv.Error):
         reader = csv.reader(io.StringIO(read_text(file, "", LARGEST), newline=""))
         head = next(reader, [])
@@ -52,10 +55,15 @@ def _read_csv(file: Path) -> dict[str, Samples]:
             raise InputError(f"{file} has two columns {twice[0]}; expected one")
         try:
             table = np.fromiter(_numbers(reader, len(head)), float).reshape(-1, len(head))
-            if len(table) < 2:
+            kept = following((1e-3 * table[:, 0]).tolist())
+            if len(kept) < 2:
                 raise ValueError("it holds fewer than two rows")
+            if lost := len(table) - len(kept):
+                remark(
+                    f"{file.name} of the {file.parent.name} has {lost} of {len(table)} rows whose time does not follow"
+                )
+            table = table[kept]
             time = 1e-3 * table[:, 0]
-            check_times(time.tolist())
         except ValueError as error:
             raise InputError(f"{file} cannot be used: {error}") from None
         return {name: (time, column[:, None]) for name, column in zip(head[1:], table.T[1:], strict=True)}
@@ -67,7 +75,7 @@ def _numbers(rows: Iterable[list[str]], width: int) -> Iterator[float]:
     fault = ""
     for number, row in enumerate(rows, start=1):
         if not fault and len(row) == width:
-            yield from map(float, row)
+            yield from (float(one or math.nan) for one in row)
             continue
         if fault or len(row) > width:
             raise ValueError(fault or f"row {number} has {len(row)} values; expected {width}")
@@ -87,5 +95,14 @@ def _joined(folder: Path, columns: dict[str, Samples]) -> dict[str, Samples]:
             time = own[0][0]
             if any(one[0][0] >= time[-1] or one[0][-1] <= time[0] for one in own):
                 raise InputError(f"{folder} has numbers of one {quantity} from different times; expected one recording")
-            joined[quantity] = time, np.column_stack([np.interp(time, one[0], one[1][:, 0]) for one in own])
+            joined[quantity] = time, np.column_stack([_at(time, *one) for one in own])
     return joined
+
+
+def _at(time: np.ndarray, rows: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """(n,) the numbers `column` (m, 1) of other `rows` (m,) at `time`, NaN where there are none."""
+    there = np.isfinite(column[:, 0])
+    if not there.any():
+        return np.full(len(time), np.nan)
+    found = np.interp(time, rows[there], column[there, 0])
+    return np.where(known(time, rows[there]), found, np.nan)

@@ -14,11 +14,13 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import rotations
-from mjxball.control.crazyflie import PERIOD, pair_gains
+from mjxball.control.crazyflie import pair_gains
 from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES
-from mjxball.fly.log_bags import BAGS, Found, read_bag
+from mjxball.fly.log_bags import Found, is_bag, read_bag
 from mjxball.fly.log_cfclient import read_cfclient
+from mjxball.fly.log_consistency import ALIKE, TURNING, known, lag
+from mjxball.fly.log_rows import IMPOSSIBLE, NEEDED, Drone, at, attitude, called, sound
 from mjxball.fly.log_schema import SCHEMA, Record, StatePacket
 from mjxball.fly.log_sources import TOPICS, VARIABLES, Samples
 from mjxball.fly.packets import DroneState
@@ -26,29 +28,22 @@ from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import Rig
 
 UNKNOWN = "an unknown follower"  # name of the policy of a flight that another program recorded
-LONGEST = 4 * 3600.0  # [s] of a recording
-NEEDED = ("position", "quaternion", "sent")
 DIFFERENT = 0.5  # share of the drones' distance by which they may be elsewhere than the rig says
-IMPOSSIBLE = 1e4  # of a position [m], a velocity [m/s], a rate [rad/s]
-UNEVEN = 0.1  # by which the length of an attitude's quaternion may differ from 1
-ALIKE = 0.5  # correlation of the two drones' rates from which on their clocks count as brought together
-
-Drone = dict[str, Samples]  # by quantity
 
 
 def is_foreign(path: Path) -> bool:
     """Whether `path` is no file of JSON lines: a folder, a bag, or a CSV file."""
-    return path.is_dir() or path.suffix in (*BAGS, ".csv")
+    return path.is_dir() or path.suffix == ".csv" or is_bag(path)
 
 
 def is_recording(path: Path) -> bool:
     """Whether `path` is a bag, or a folder that is one or has cfclient's two."""
     if not path.is_dir():
-        return path.suffix in BAGS
+        return is_bag(path)
     if (path / "config.json").exists():
         return False  # a run of train.py
     names = ("metadata.yaml", *NAMES)
-    return any((path / name).exists() for name in names) or any(one.suffix in BAGS for one in path.iterdir())
+    return any((path / name).exists() for name in names) or any(map(is_bag, path.iterdir()))
 
 
 def read(path: Path, remark: Callable[[str], None], assumed: Config | None = None) -> bytes | list[Record]:
@@ -77,46 +72,28 @@ def read(path: Path, remark: Callable[[str], None], assumed: Config | None = Non
 
 def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
     """Leader and follower, whose clocks are brought together by their rates, which are the stick's."""
-    pair = list(read_cfclient(path).values())
-    for name, own in zip(NAMES, pair, strict=True):
+    pair = list(read_cfclient(path, remark).values())
+    for number, (name, own) in enumerate(zip(NAMES, pair, strict=True)):
         lacking = [what for what in (*NEEDED, "rates") if what not in own]
         if lacking:
             wanted = ", ".join(variable for variable, one in VARIABLES.items() if one.quantity == lacking[0])
             raise InputError(f"{path / name} has no {lacking[0]}; expected all numbers of it of {wanted}")
-        _check(path, own, name)
-    late, alike = _lag(*(own["rates"] for own in pair))
-    if alike < ALIKE:
+        pair[number] = sound(path, own, name, remark)
+    found = lag(pair[0]["rates"], pair[1]["rates"], TURNING)
+    if found.alike < ALIKE:
         raise InputError(
-            f"{path} is of two clocks: at best the drones' rates agree by {alike:.2f}; expected {ALIKE:g} or more, of "
-            "two drones on one stick"
+            f"{path} is of two clocks: at best the drones' rates agree by {found.alike:.2f}; expected {ALIKE:g} or "
+            "more, of two drones on one stick"
         )
-    remark(f"the follower's clock is put {late:+.3f} s to the leader's, where their rates agree")
-    pair[1] = {name: (times + late, rows) for name, (times, rows) in pair[1].items()}
+    remark(f"the follower's clock is put {-found.at_begin:+.3f} s to the leader's, where their rates agree")
+    pair[1] = {name: (found.on_first_clock(times), rows) for name, (times, rows) in pair[1].items()}
     _check_overlap(path, dict(zip(NAMES, pair, strict=True)))
     return pair
-
-
-def _lag(one: Samples, other: Samples) -> tuple[float, float]:
-    """(seconds to add to the clock of `other` so that its rates are those of `one`, correlation then)."""
-    grids = [np.arange(time[0], time[-1], PERIOD) for time, _ in (one, other)]
-    a, b = (
-        np.stack([np.interp(grid, time, row) for row in (rows - rows.mean(axis=0)).T])
-        for grid, (time, rows) in zip(grids, (one, other), strict=True)
-    )
-    length = a.shape[1] + b.shape[1]
-    products = np.fft.rfft(a, length) * np.conj(np.fft.rfft(b, length))
-    agree = np.fft.irfft(products, length).sum(axis=0)
-    best = int(np.argmax(agree))
-    shift = best if best < a.shape[1] else best - length
-    scale = np.sqrt(float((a**2).sum() * (b**2).sum()))
-    return float(grids[0][0] - grids[1][0] + shift * PERIOD), float(agree[best] / scale) if scale else 0.0
 
 
 def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -> list[Drone]:
     """Leader and follower by their names, or by where on the stick they are."""
     whole = {name: own for name, own in found.series.items() if own.keys() >= set(NEEDED)}
-    for name, own in whole.items():
-        _check(path, own, name)
     if whole.keys() >= set(NAMES):
         whole = {name: whole[name] for name in NAMES}
     if len(whole) != 2:
@@ -125,6 +102,7 @@ def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -
             f"bag {path} holds {len(whole)} drones with poses and setpoints; expected two, each with {names[0]} or "
             f"{names[1]}, and {names[2]}; found {found.has}"
         )
+    whole = {name: sound(path, own, name, remark) for name, own in whole.items()}
     _check_overlap(path, whole)
     if whole.keys() == set(NAMES):
         return [*whole.values()]
@@ -149,49 +127,14 @@ def _told(vector: np.ndarray) -> str:
 def _from_each_other(first: Drone, second: Drone) -> np.ndarray:
     """(3,) usual place of `first` from `second` in its own axes [m]."""
     time, position = first["position"]
-    matrices = rotations.matrix_from_quaternion(_attitude(time, first))
-    return np.median(np.einsum("nji,nj->ni", matrices, position - _at(time, second["position"])), axis=0)
-
-
-def _at(time: np.ndarray, samples: Samples) -> np.ndarray:
-    """`samples` at `time` (n,), in between on a straight line."""
-    return np.stack([np.interp(time, samples[0], column) for column in samples[1].T], axis=1)
-
-
-def _attitude(time: np.ndarray, own: Drone) -> np.ndarray:
-    """(n, 4) unit quaternions at `time`."""
-    when, rows = own["quaternion"]
-    turns = np.cumprod([1.0, *np.where((rows[1:] * rows[:-1]).sum(axis=1) < 0, -1.0, 1.0)])
-    found = _at(time, (when, rows * turns[:, None]))
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
-
-
-def _check(path: Path, own: Drone, name: str) -> None:
-    """Raise InputError if a series is too short or too long, not of finite numbers, or its attitudes are none."""
-    for quantity, (time, rows) in own.items():
-        what = f"{path}: {_called(quantity)} of {name}"
-        if len(time) < 2:
-            raise InputError(f"{what} is there once; expected it twice or more")
-        lost = np.count_nonzero(~np.isfinite(rows).all(axis=1))
-        if lost and quantity != "battery":
-            raise InputError(f"{what} is not finite in {lost} of {len(time)} rows; expected finite numbers")
-        if time[-1] - time[0] > LONGEST:
-            span = f"{time[-1] - time[0]:.3g} s"
-            raise InputError(f"{what} goes on for {span}; expected {LONGEST:g} s or less")
-    lengths = np.linalg.norm(own["quaternion"][1], axis=1)
-    worst = lengths[np.abs(lengths - 1).argmax()]
-    if abs(worst - 1) > UNEVEN:
-        raise InputError(f"{path}: {name} has a quaternion of length {worst:.2g}; expected 1")
-
-
-def _called(quantity: str) -> str:
-    return {"sent": "setpoint", "along": "velocity", "rates": "body rate"}.get(quantity, quantity)
+    matrices = rotations.matrix_from_quaternion(attitude(time, first))
+    return np.median(np.einsum("nji,nj->ni", matrices, position - at(time, second["position"])), axis=0)
 
 
 def _check_overlap(path: Path, pair: dict[str, Drone]) -> None:
     """Raise InputError if there is no time at which all that is known of both drones was recorded."""
     spans = {
-        f"{_called(quantity)} of {name}": (time[0], time[-1])
+        f"{called(quantity)} of {name}": (time[0], time[-1])
         for name, own in pair.items()
         for quantity, (time, _) in own.items()
         if quantity != "battery"
@@ -207,18 +150,16 @@ def _check_overlap(path: Path, pair: dict[str, Drone]) -> None:
 def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[float, DroneState]]:
     """The states of one drone at the times of its positions."""
     time, position = own["position"]
-    quaternion = _attitude(time, own)
-    matrices = rotations.matrix_from_quaternion(quaternion)
+    quaternion = attitude(time, own)
     derived = []
-    if "velocity" in own:
-        velocity = _at(time, own["velocity"])
-    elif "along" in own:
-        velocity = np.einsum("nij,nj->ni", matrices, _at(time, own["along"]))
+    moving = own.get("velocity", own.get("along"))
+    if moving is not None:
+        velocity = at(time, moving)
     else:
         velocity = np.gradient(position, time, axis=0)
-        derived.append("velocity")
+        derived.append("velocities")
     if "rates" in own:
-        rates = _at(time, own["rates"])
+        rates = at(time, own["rates"])
     else:
         change = np.gradient(quaternion, time, axis=0)
         back = quaternion * np.array([1.0, -1.0, -1.0, -1.0])
@@ -229,16 +170,22 @@ def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[
     for what, values in (("position", position), ("velocity", velocity), ("rates", rates)):
         if (largest := float(np.abs(values).max())) > IMPOSSIBLE:
             raise InputError(f"the {name}'s {what} reaches {largest:.3g}, expected metres, m/s and rad/s")
-    battery = _at(time, own["battery"])[:, 0] if "battery" in own else np.full(len(time), np.nan)
+    battery = at(time, own["battery"])[:, 0] if "battery" in own else np.full(len(time), np.nan)
+    told = np.logical_and.reduce(
+        [known(time, own[what][0]) for what in ("quaternion", "velocity", "along", "rates") if what in own]
+    )
     rows = zip(position, velocity, quaternion, rates, battery, strict=True)
-    return [(float(now), DroneState(*row[:4], 0, float(row[4]))) for now, row in zip(time, rows, strict=True)]
+    return [
+        (float(now), DroneState(*row[:4], 0, float(row[4])))
+        for now, row, sure in zip(time, rows, told, strict=True)
+        if sure
+    ]
 
 
 def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent: list[Samples]) -> list[Record]:
     """A header, states, and a tick for each of the leader's setpoints once the follower has one; laws fly it all."""
-    begin = min(own[0][0] for own in states)
     header = {"schema": SCHEMA, "policy": UNKNOWN, "config": config, "gains": pair_gains(config.autopilot)}
-    found: list[Record] = [{"t": begin, "kind": "header", **header}]
+    found: list[Record] = []
     for name, own in zip(NAMES, states, strict=True):
         found += [{"t": now, "kind": "state", "drone": name, "raw": StatePacket(0, state)} for now, state in own]
     (times, leader), (others, follower) = sent
@@ -249,4 +196,5 @@ def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent:
         state = State.FLY if (setpoints[:, 3] > 0).all() else State.DONE
         found.append({"t": float(now), "kind": "tick", "state": state.value, "goal": goal, "sent": setpoints})
     found.sort(key=lambda one: float(one["t"]))
-    return [*found, {"t": found[-1]["t"], "kind": "end", "code": 0}]
+    first, last = found[0]["t"], found[-1]["t"]
+    return [{"t": first, "kind": "header", **header}, *found, {"t": last, "kind": "end", "code": 0}]

@@ -47,7 +47,8 @@ def _pose(one: Any) -> Iterator[Part]:
 
 def _odometry(one: Any) -> Iterator[Part]:
     pose, moving = one.pose.pose, one.twist.twist
-    yield "", one.header, {**_place(pose.position, pose.orientation), "velocity": _xyz(moving.linear)}
+    moves = {"velocity": _xyz(moving.linear), "rates": _xyz(moving.angular)}
+    yield "", one.header, {**_place(pose.position, pose.orientation), **moves}
 
 
 def _transforms(one: Any) -> Iterator[Part]:
@@ -87,10 +88,10 @@ def _line(one: Any) -> Iterator[Part]:
 TOPICS = {
     HEADER: Topic("std_msgs/String", "the first line of our own flight log; nothing but the next is then read", _line),
     RECORD: Topic("std_msgs/String", "its other lines", _line),
-    "odom": Topic("nav_msgs/Odometry", "position, attitude; velocity in the world, as Crazyswarm2 has it", _odometry),
+    "odom": Topic("nav_msgs/Odometry", "position, attitude; velocity, rates, in the axes that these tell", _odometry),
     "pose": Topic("geometry_msgs/PoseStamped", "position and attitude", _pose),
     "tf": Topic("tf2_msgs/TFMessage", "position and attitude of the child frame, which is the drone", _transforms),
-    "twist": Topic("geometry_msgs/TwistStamped", "velocity and rates in the drone's axes", _twist),
+    "twist": Topic("geometry_msgs/TwistStamped", "velocity and rates, in the axes that the poses tell", _twist),
     "gyro": Topic(
         "crazyflie_interfaces/LogDataGeneric",
         "rates: a custom topic called `gyro` of `gyro.x`, `gyro.y`, `gyro.z` [deg/s]",

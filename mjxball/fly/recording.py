@@ -15,9 +15,10 @@ from mjxball.config import Config
 from mjxball.control import crazyflie
 from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
-from mjxball.fly import flight_log
+from mjxball.fly import flight_log, log_consistency
 from mjxball.fly.card import ThrustChoice, command_maps, drone_of, gains_of, with_curve
 from mjxball.fly.limits import NAMES, ticks_per_command
+from mjxball.fly.log_consistency import SILENCE
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
 from mjxball.fly.setpoints import CURVE_NAMES, CurveName, ForceCurve
@@ -28,7 +29,6 @@ from mjxball.fly.twin.pair import PairState
 from mjxball.fly.twin.physics import pair_of
 from mjxball.reading import check_times
 
-SILENCE = 0.1  # [s] between two states of a drone from which on the log has a gap
 FROZEN = 0.25  # [s] of equal states from which on an estimator counts as frozen while the laws are in command
 OFF_RATE = 0.2  # share of the control period by which ticks may be apart
 GUIDED = State.FLY.value  # both laws fly
@@ -143,6 +143,7 @@ def load(path: Path, assumed: Config | None = None) -> FlightLog:
     for gap in found:
         what = f"the {gap.drone}'s estimate is frozen" if gap.frozen else f"there is no state of the {gap.drone}"
         remarks.append(f"{what} for {gap.end - gap.begin:.2f} s from {max(gap.begin - turning[0], 0.0):.1f} s on")
+    remarks += _faults(flown)
     setup = FirmwareSetup.of_header(header)
     for one in records:
         setup = setup.after(one, header["config"])
@@ -160,6 +161,18 @@ def _tick_remarks(times: list[float], config: Config) -> list[str]:
     if abs(usual - period) > OFF_RATE * period:
         found.append(f"its ticks are {1e3 * usual:.3g} ms apart, and the policy's are {1e3 * period:.3g} ms")
     return found
+
+
+def _faults(rows: Sequence[Record]) -> list[str]:
+    """What is wrong with the clocks of a flight, while both laws are in command."""
+    ticks = [one for one in rows if one["kind"] == "tick" and one["state"] == GUIDED]
+    if len(ticks) < 2:
+        return []
+    states = [[one for one in rows if one["kind"] == "state" and one["drone"] == name] for name in NAMES]
+    return log_consistency.faults(
+        (np.array([one["t"] for one in ticks]), np.array([one["sent"] for one in ticks])),
+        [(np.array([one["t"] for one in own]), np.array([numbers(one["raw"].state) for one in own])) for own in states],
+    )
 
 
 def outages(drone: str, time: np.ndarray, states: np.ndarray, end: float) -> list[Outage]:

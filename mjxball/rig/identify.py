@@ -24,7 +24,7 @@ from mjxball.fly.card import with_curve
 from mjxball.fly.preflight import read_gains
 from mjxball.fly.recording import one_curve, own_curve
 from mjxball.fly.setpoints import CurveName
-from mjxball.rig.fit import Estimate, identify, pair_mass
+from mjxball.rig.fit import LONGEST_DELAY, Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log
 from mjxball.terminal import warn
 
@@ -202,6 +202,10 @@ def report(settings: config.Config, found: Estimate) -> str:
     ]
     if max(thrust, inertia, lag) > 0.1:
         lines.append("  too little moves in this log: fly steps of roll and of height")
+    if not 0.0 < found.delay < LONGEST_DELAY:
+        lines.append(
+            f"  the delay is not within 0 to {1e3 * LONGEST_DELAY:.0f} ms: log setpoints and states by one clock"
+        )
     if found.inertia < 0.95 * computed:
         lines.append("  less inertia than masses and places give: weigh and measure the rig again")
     return "\n".join(lines)

@@ -13,10 +13,11 @@ from mjxball.control import rotations
 from mjxball.control.crazyflie import PERIOD, PairGains
 from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES
+from mjxball.fly.log_consistency import UNEVEN, faults
 from mjxball.fly.recording import GUIDED, FlightLog, Outage, load, numbers, outages
 from mjxball.fly.setpoints import CurveName
 from mjxball.policy.container import read_arrays
-from mjxball.reading import check_times
+from mjxball.reading import check_times, following
 
 STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
 OFF_THE_GROUND = 0.03  # [m] above the start of a flight from which on nothing touches the pair
@@ -67,7 +68,8 @@ def make_log(
     """Bring setpoints (T, 2, 4) at `sent_at` and two drones' `states` (S, 13) at `seen_at` onto the ticks.
 
     `guided` (T,) says at which setpoints of a flight, which starts on the ground, the laws were in command; if it is
-    not given, they always were, in the air. Raises ValueError if the arrays are unsound.
+    not given, they always were, in the air. Rows with numbers that are none are missing. Raises ValueError if the
+    arrays are unsound, or of clocks that differ.
     """
     times = [seen_at, seen_at] if isinstance(seen_at, np.ndarray) else list(seen_at)
     count = len(sent_at)
@@ -75,13 +77,14 @@ def make_log(
         raise ValueError("shapes do not fit: time (T,), setpoints (T, 2, 4), states (T, 2, 13)")
     if min(count, *map(len, times)) < 2:
         raise ValueError("it holds fewer than two rows")
-    if not all(np.isfinite(part).all() for part in (sent_at, setpoints, *states, *times)):
-        raise ValueError("numbers are missing or not finite")
-    for name, t in zip(("setpoints", *NAMES), (sent_at, *times), strict=True):
-        try:
-            check_times(t.tolist(), *STEPS)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+    kept, remarks = _kept((sent_at, *times), (setpoints, *states))
+    sent_at, setpoints = sent_at[kept[0]], setpoints[kept[0]]
+    guided = None if guided is None else guided[kept[0]]
+    times = [t[own] for t, own in zip(times, kept[1:], strict=True)]
+    states = [rows[own] for rows, own in zip(states, kept[1:], strict=True)]
+    flown = slice(None) if guided is None else guided
+    for fault in faults((sent_at[flown], setpoints[flown]), list(zip(times, states, strict=True))):
+        raise ValueError(fault)
     grid = np.arange(max(t[0] for t in (sent_at, *times)), min(t[-1] for t in (sent_at, *times)), PERIOD)
     latest = np.searchsorted(sent_at, grid + 1e-9, side="right") - 1
     rows = [_on_grid(grid, t, s) for t, s in zip(times, states, strict=True)]
@@ -92,7 +95,31 @@ def make_log(
         height = np.mean([np.interp(grid, t, s[:, 2] - s[0, 2]) for t, s in zip(times, states, strict=True)], axis=0)
         usable &= guided[latest] & (height > OFF_THE_GROUND)
     found = [gap for name, t, s in zip(NAMES, times, states, strict=True) for gap in outages(name, t, s, t[-1])]
-    return Log(setpoints[latest], climb, euler, rates, usable & ~_within(grid, found), every)
+    return Log(setpoints[latest], climb, euler, rates, usable & ~_within(grid, found), every, remarks)
+
+
+def _kept(times: Sequence[np.ndarray], series: Sequence[np.ndarray]) -> tuple[list[np.ndarray], tuple[str, ...]]:
+    """Of setpoints and both drones' states the rows that are whole, in the order of time, and what is missing.
+
+    Raises ValueError if too little is left.
+    """
+    kept, remarks = [], []
+    for name, time, rows in zip(("setpoints", *NAMES), times, series, strict=True):
+        whole = np.isfinite(time) & np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+        if name in NAMES:
+            whole &= np.abs(np.linalg.norm(rows[:, 6:10], axis=1) - 1) <= UNEVEN
+        found = np.flatnonzero(whole)
+        if len(found) < 2:
+            raise ValueError("numbers are missing or not finite")
+        try:
+            found = found[following(time[found].tolist())]
+            check_times(time[found].tolist(), *STEPS)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        if lost := len(time) - len(found):
+            remarks.append(f"{lost} rows of its {name} are missing")
+        kept.append(found)
+    return kept, tuple(remarks)
 
 
 def _on_grid(grid: np.ndarray, time: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -132,7 +159,7 @@ def _of_flight(flown: FlightLog) -> Log:
         raise InputError(f"flight log {flown.path} cannot be used: {error}") from None
     volts = [one["raw"].state.battery for rows in own for one in rows]
     return log._replace(
-        remarks=flown.remarks,
+        remarks=(*flown.remarks, *log.remarks),
         stand=flown.config.plant.stand,
         gains=flown.setup.gains,
         curves=flown.setup.curves,

@@ -23,7 +23,7 @@ from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.files import write_whole
-from mjxball.fly.log_bags import BAGS
+from mjxball.fly.log_bags import is_bag
 from mjxball.fly.log_import import UNKNOWN
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
@@ -171,7 +171,7 @@ def read_log(path: Path) -> Flight:
     """
     from mjxball.fly.recording import read_recording
 
-    if path.suffix not in (".jsonl", *BAGS):
+    if path.suffix != ".jsonl" and not is_bag(path):
         raise InputError(
             f"{path} is no flight (.npz), flight log (.jsonl) or bag (.mcap), policy (.npz) or run directory"
         )

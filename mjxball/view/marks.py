@@ -137,7 +137,7 @@ def _told(path: Path) -> Iterable[Record]:
 
 def _decoded(line: bytes) -> Record | None:
     try:
-        raw: Any = parse_json(line.decode())
+        raw: Any = parse_json(line)
         return decode(raw)
     except (ValueError, KeyError, TypeError, RecursionError):
         return None

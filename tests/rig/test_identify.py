@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -131,6 +132,43 @@ def test_damaged_logs_are_refused(tmp_path: Path, change: dict[str, np.ndarray],
         read_log(tmp_path / "a.npz")
 
 
+def test_clocks_that_differ_are_refused(brief) -> None:
+    """By what the drones' states are late, and how much faster their clocks are."""
+    time = brief["time"]
+    for late, faster, said in (
+        ((0, 0), (1, 1), None),
+        ((0, -0.02), (1, 1), None),
+        ((0, -0.05), (1, 1), "by their rates the follower's states are 0.05. s early against the leader's"),
+        ((0, -0.15), (1, 1), "by their rates the follower's states are 0.15. s early against the leader's"),
+        ((-0.15, 0), (1, 1), r"by their rates the follower's states are 0.1(49|5.) s late against the leader's"),
+        ((-0.15, -0.15), (1, 1), "the pair follows what was sent after -0.06. s at first"),
+        ((0.3, 0.3), (1, 1), "the pair follows what was sent after 0.38. s at first"),
+        ((0, 0), (1, 1.01), "the follower's states are 0.00. s late at first and 0.05. s late at last"),
+        ((0, 0), (1, 1.3), "the follower's positions change by 0.77 of its velocities, and its attitudes by 0.7"),
+        ((0, 0), (1.3, 1.3), "the leader's positions change by 0.77 of its velocities, and its attitudes by 0.7"),
+    ):
+        seen = [time * factor + shift for factor, shift in zip(faster, late, strict=True)]
+        states = [brief["states"][:, 0], brief["states"][:, 1]]
+        with pytest.raises(ValueError, match=said) if said else contextlib.nullcontext():
+            assert make_log(time, brief["setpoints"], seen, states).usable.sum() > 5 / 0.002
+
+
+def test_rows_that_hold_nothing_are_missing(brief, tmp_path: Path) -> None:
+    """40 rows of the follower's states in an .npz, and 3 times of its rows."""
+    states, time = brief["states"].copy(), brief["time"].copy()
+    whole = make_log(time, states=[states[:, 0], states[:, 1]], setpoints=brief["setpoints"], seen_at=time)
+    for number, nothing in enumerate((np.nan, np.inf, 0.0)):
+        states[200:240, 1] = nothing
+        np.savez(tmp_path / f"{number}.npz", **{**brief, "states": states})
+        found = read_log(tmp_path / f"{number}.npz")
+        assert found.remarks == ("40 rows of its follower are missing",)
+        assert (whole.usable & ~found.usable).sum() == pytest.approx(0.41 / 0.002, abs=2)
+        np.testing.assert_array_equal(found.rates[found.usable], whole.rates[found.usable])
+    time[300:303] = 0.0
+    np.savez(tmp_path / "time.npz", **{**brief, "time": time})
+    assert "3 rows of its leader are missing" in read_log(tmp_path / "time.npz").remarks
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         read_log(tmp_path / "none.npz")
@@ -165,6 +203,10 @@ class TestPlantFile:
         light = SOME._replace(inertia=0.8 * COMPUTED)
         validate(cli.apply_plant(PAIR, self.write(tmp_path, light)))
         assert "weigh and measure" in command.report(PAIR, light)
+
+    def test_a_delay_at_the_end_of_its_range_is_told(self) -> None:
+        for delay, told in ((0.0, True), (0.008, False), (0.06, True)):
+            assert ("by one clock" in command.report(PAIR, SOME._replace(delay=delay))) is told
 
     def test_train_takes_it_with_its_preset(self, tmp_path: Path) -> None:
         options = train.parser().parse_args(["--plant", str(self.write(tmp_path)), "--out", str(tmp_path / "run")])
