@@ -66,7 +66,7 @@ def test_half_an_hour_of_float32_steps_takes_half_an_hour() -> None:
     assert float(end.time) == 1800.0
     places = jnp.asarray(PLACES)
     for kind, path in {
-        "sine": lambda time, *given: motion.sine(time, *given),
+        "sine": motion.sine,
         "ellipse": lambda time, *given: motion.lissajous(time, *given, ELLIPSE),
         "waypoints": lambda time, *given: motion.waypoints(time, *given, places),
     }.items():
