@@ -11,6 +11,7 @@ from command_line import HASTY, REPOSITORY
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.train.extensions import find
 
 TINY = {
     **{"sac.num_envs": 4, "sac.replay_size": 80, "sac.warmup_steps": 8, "sac.batch_size": 4},
@@ -23,7 +24,6 @@ import sys
 import jax, numpy as np
 from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
-from mjxball.errors import InputError
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, resolve
 from mjxball.train.population import Population
@@ -35,11 +35,9 @@ for algorithm in ALGORITHMS:
     for units in (0, 4):
         config = configs.replace(tiny, "follower.recurrent_units", units)
         extensions = resolve(Extensions(algorithm=ALGORITHMS[algorithm]))
-        try:
-            population = Population(config, sys.argv[1], 2, extensions=extensions)
-        except InputError as refusal:
-            print(algorithm, units, "refused:", refusal, flush=True)
+        if sys.argv[1] not in extensions.algorithm.engines:
             continue
+        population = Population(config, sys.argv[1], 2, extensions=extensions)
         assert population.devices == jax.local_device_count() == 2
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
@@ -61,7 +59,8 @@ def test_every_algorithm_trains_two_members_on_two_devices(engine: str) -> None:
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", CODE, engine]
     done = subprocess.run(
-        command, check=False, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=570
+        command, check=False, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.splitlines() == [f"{name} {units} trained" for name in ALGORITHMS for units in (0, 4)]
+    algorithms = [name for name in ALGORITHMS if engine in find(name, "--algorithm").engines]
+    assert done.stdout.splitlines() == [f"{name} {units} trained" for name in algorithms for units in (0, 4)]
