@@ -103,8 +103,8 @@ def follower_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
             (times[look], times[look[:2]], times[look[:1]], (k - place) % len(COLOURS), k // len(COLOURS))
             for k, look in enumerate(FREE)
         ]
-        known[name] = FREE[ranks.index(min(ranks))]
-        drawn.append(known[name])
+        known[name] = own = FREE[ranks.index(min(ranks))]
+        drawn.append(own)
     looks = {name: _arguments(*look) for name, look in known.items() if look}
     if SIMULATED in looks:
         looks = {name: {**look, "linewidth": 0.8} for name, look in looks.items()}
