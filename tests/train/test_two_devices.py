@@ -14,7 +14,7 @@ from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.train.extensions import find
 
 TINY = {
-    **{"sac.num_envs": 4, "sac.replay_size": 80, "sac.warmup_steps": 8, "sac.batch_size": 4},
+    **{"sac.num_envs": 4, "sac.replay_size": 160, "sac.warmup_steps": 80, "sac.batch_size": 16},
     **{"sac.updates_per_step": 1, "sac.policy_layers": (8,), "sac.critic_layers": (8,)},
     **{"ppo.num_envs": 8, "ppo.minibatches": 2, "ppo.unroll_length": 4, "ppo.policy_layers": (8,)},
     **{"gradient.num_envs": 4, "gradient.horizon": 4, "gradient.policy_layers": (8,), "timing.episode_steps": 8},
@@ -42,7 +42,7 @@ for algorithm in ALGORITHMS:
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
         for mode in (programs.warmup, programs.train, programs.train, programs.evaluate):
-            state, *_ = advance(population, compiled, state, mode(population.program.algorithm.steps_per_collect))
+            state, *_ = advance(population, compiled, state, mode(20))
         floats = [leaf for leaf in jax.tree.leaves(state.algorithm) if leaf.dtype == np.float32]
         assert all(len(leaf.sharding.device_set) == 2 for leaf in floats)
         assert all(np.isfinite(np.asarray(leaf)).all() for leaf in floats)
