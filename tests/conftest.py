@@ -2,37 +2,19 @@
 
 from __future__ import annotations
 
+import surroundings  # noqa: F401  (before JAX reads what it sets)
+
+# isort: split
 import atexit
 import contextlib
 import dataclasses
 import fcntl
 import os
 import shutil
-import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-
-
-def as_at_a_terminal() -> None:
-    """Set what tests and the processes they start rely on, whoever started pytest.
-
-    `nohup` and scripts that go on by themselves ignore signals, and shells have settings of their own.
-    """
-    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM):
-        if signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-    os.umask(0o022)
-    for name in [name for name in os.environ if name.startswith(("JAX_", "LC_", "PYTHON")) or name in FROM_A_SHELL]:
-        if name not in ("JAX_PLATFORMS", "PYTHONPATH"):
-            del os.environ[name]
-    os.environ["LANG"] = "C.UTF-8"
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-
-
-FROM_A_SHELL = ("COLUMNS", "FORCE_COLOR", "LINES", "NO_COLOR", "TZ")
-as_at_a_terminal()  # before the first import of JAX
 
 import hypothesis
 import jax
