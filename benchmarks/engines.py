@@ -73,6 +73,7 @@ def random_states(plant: Plant, count: int, random: np.random.Generator) -> Plan
         velocity=velocity,
         rates=rates,
         rotor_force=random.uniform(0, plant.rotor_force_max, (count, plant.count, 4)),
+        ticks=np.zeros(count, int),
         time=random.uniform(0, 20, count),
         ball_offset=random.uniform(-half, half, places),
         ball_rate=random.normal(size=places),

@@ -3,12 +3,13 @@
 A row is steady if the flight does not fail, no peak later than 20 s is more than 1.5 times that of the shortest flight
 and 5 mm, and a rotor is at its limit in less than a fifth of the time. A policy for any rig flies a pair and rings of
 three, four and six; one for teams rings of every number of drones between its smallest and its largest. Numbers are
-those of docs/metrics.md, computed in float32; ideal sensors.
+those of docs/metrics.md, computed in float32; ideal sensors. Means over a flight stand beside those over its last 20 s.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -29,7 +30,8 @@ MINUTE, TEN = 60.0, 600.0  # [s]
 SPEEDS = (0.31, 1.0)  # of the CG [rad/s]
 GROWTH, SLACK, LIMITED = 1.5, 0.005, 0.2  # of a steady flight: of its peaks, [m], share of the time
 PEAKS = ("x_peak", "y_peak", "z_peak")
-SHOWN = ("rotors_at_limit", "rotor_power", "command_spread")
+MEANS = {"rotors_at_limit": 1, "rotor_power": 1, "command_spread": 2}  # with the power of what is averaged
+LAST = 20.0  # [s] of a flight, its end
 RIGS = ("pair", "team3", "team4", "team6")  # plants of a policy for any rig
 
 
@@ -78,15 +80,29 @@ def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> l
     batch, rows, first = Batch(setup, load_policy(path, setup)), [], []
     for seconds in horizons:
         scenarios = own_scenarios(setup, seconds)
-        found = batch.fly(scenarios)
+        found, shorter = batch.fly(scenarios), batch.fly(own_scenarios(setup, seconds - LAST))
         first = first or found
-        for scenario, metrics, start in zip(scenarios, found, first, strict=True):
-            numbers = {name: getattr(metrics, name) for name in (*PEAKS, *SHOWN, "failed")}
+        period = setup.timing.control_period
+        rows_of_flight = round(seconds / period) + 1, round(LAST / period)
+        for scenario, metrics, before, start in zip(scenarios, found, shorter, first, strict=True):
+            numbers = {name: getattr(metrics, name) for name in (*PEAKS, *MEANS, "failed")}
+            numbers |= at_end(metrics, before, *rows_of_flight)
             motion = f"{scenario.omega:g} rad/s" if scenario.amplitude else "ball" if scenario.ball_start else "rest"
             row = {"policy": path.stem, "plant": label, "drones": setup.plant.count, "motion": motion}
             rows.append({**row, "seconds": seconds, **numbers, "steady": is_steady(metrics, start)})
             say(rows[-1])
     return rows
+
+
+def at_end(metrics: Metrics, before: Metrics, rows: int, last: int) -> dict[str, float | None]:
+    """Means over the `last` of a flight's `rows`, from its own and those of the rows `before` them."""
+    found: dict[str, float | None] = {}
+    for name, power in MEANS.items():
+        whole, begun = getattr(metrics, name), getattr(before, name)
+        known = whole is not None and begun is not None
+        mean = (rows * whole**power - (rows - last) * begun**power) / last if known else None
+        found[f"{name}_at_end"] = None if mean is None else math.copysign(abs(mean) ** (1 / power), mean)
+    return found
 
 
 def is_steady(metrics: Metrics, start: Metrics) -> bool:

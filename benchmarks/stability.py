@@ -153,7 +153,8 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     def step(z: Array, load: Load) -> Array:
         unflatten = flat(*first(load))[1]
         position, euler, velocity, rates, rotors, memory, older = unflatten(z)
-        plant = PlantState(position, rotations.quaternion_from_euler(euler), velocity, rates, rotors, zero, zero, zero)
+        begin, turn = jnp.zeros((), jnp.int32), rotations.quaternion_from_euler(euler)
+        plant = PlantState(position, turn, velocity, rates, rotors, begin, zero, zero, zero)
         past = jnp.concatenate([loop.observe(plant, goal)[None], older])
         sensors = SensorState(delay, (), past) if delay else SensorState()
         state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
@@ -161,7 +162,7 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
         moved, _, _ = loop.step(state, past[-1], answer, load, (goal, goal), Sample(), 0.0)
         older = moved.sensors.past[1:] if delay else older
         # A flight that diverged stays where it was, which is no hover.
-        return jnp.where(moved.diverged, jnp.nan, flat(moved.plant._replace(time=zero), memory, older)[0])
+        return jnp.where(moved.diverged, jnp.nan, flat(moved.plant, memory, older)[0])
 
     if config.autopilot.kind != "ideal":
         raise ValueError("a firmware's whole numbers have no derivative: only the ideal autopilot is linearised")

@@ -83,6 +83,15 @@ def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
     _sync_folder(target.parent)
 
 
+def user_cache() -> Path | None:
+    """The folder for what is kept between runs and can be made again; None for whoever has no home directory."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "mjxball"
+    except RuntimeError:
+        return None
+
+
 def _sync_folder(folder: Path) -> None:
     """Have the folder's new entry on disk; where a file system cannot, it is there as soon as it may be."""
     with contextlib.suppress(OSError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -27,8 +28,18 @@ TABLE = (
     (DASH_DOT, ("mpc", "copy", "pid", "adaptive", "observer", "adaptive-mass")),
     (DOT, ("oracle", "", "memoryless", "", "random", "stay")),
 )
-FREE = tuple((colour, dash) for dash in (LONG, SHORT) for colour in COLOURS)  # for all other names
-LOOKS = {name: (colour, dash) for dash, names in TABLE for colour, name in zip(COLOURS, names, strict=True) if name}
+LOOKS = {
+    name: (colour, dash, MARKERS[colour])
+    for dash, names in TABLE
+    for colour, name in zip(COLOURS, names, strict=True)
+    if name
+}
+# For all other names: dashes and markers that none of the table has. The first twelve differ without their markers.
+FREE = tuple(
+    (colour, (LONG, SHORT)[turn % 2], "X*hp<d"[(k + turn) % len(COLOURS)])
+    for turn in range(len(COLOURS))
+    for k, colour in enumerate(COLOURS)
+)
 SIMULATED = "the same, simulated"  # beside a flight that was flown
 
 _COMMON = {"text.parse_math": False, "svg.fonttype": "none", "pdf.fonttype": 42, "legend.frameon": False}
@@ -80,18 +91,21 @@ def file_format() -> str:
 def follower_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour, dash and marker of each follower of one figure, as arguments of `plot`.
 
-    Those of `TABLE` are fixed. Another name has the place of `FREE` that its checksum says, or the next one that no
-    other name of the figure has.
+    Those of `TABLE` are fixed. Another name has a place of `FREE` that no other name of the figure has, of the colours
+    that are there least often the one that its checksum says. The colour of `copy`, which stands in most figures,
+    counts as if it were there.
     """
-    looks, free = {}, list(FREE)
-    for name in sorted(set(names)):
-        look = LOOKS.get(re.sub(r"(, flown| \(FORCED\))*$", "", name))
-        if look is None:
-            free = free or list(FREE)
-            first = zlib.crc32(name.encode()) % len(FREE)
-            look = next(one for one in (*FREE[first:], *FREE[:first]) if one in free)
-            free.remove(look)
-        looks[name] = _arguments(*look)
+    known = {name: LOOKS.get(re.sub(r"(, flown| \(FORCED\))*$", "", name)) for name in sorted(set(names))}
+    drawn = [look for look in (LOOKS["copy"], *known.values()) if look]
+    for name in (name for name, look in known.items() if look is None):
+        place, times = zlib.crc32(name.encode()), Counter(look[:kept] for look in drawn for kept in (1, 2, 3))
+        ranks = [
+            (times[look], times[look[:2]], times[look[:1]], (k - place) % len(COLOURS), k // len(COLOURS))
+            for k, look in enumerate(FREE)
+        ]
+        known[name] = own = FREE[ranks.index(min(ranks))]
+        drawn.append(own)
+    looks = {name: _arguments(*look) for name, look in known.items() if look}
     if SIMULATED in looks:
         looks = {name: {**look, "linewidth": 0.8} for name, look in looks.items()}
         looks[SIMULATED] = {"color": INK, "linewidth": 4.0, "alpha": 0.4, "zorder": 1.5, "marker": "none"}
@@ -100,11 +114,14 @@ def follower_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 def series_styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The same for curves that are not of different followers, in order."""
-    return {label: _arguments(COLOURS[k % len(COLOURS)], DASHES[k % len(DASHES)]) for k, label in enumerate(labels)}
+    colours = [COLOURS[k % len(COLOURS)] for k in range(len(labels))]
+    dashes = [DASHES[k % len(DASHES)] for k in range(len(labels))]
+    looks = zip(labels, colours, dashes, strict=True)
+    return {label: _arguments(colour, dash, MARKERS[colour]) for label, colour, dash in looks}
 
 
-def _arguments(colour: str, dash: Any) -> dict[str, Any]:
-    return {"color": colour, "linestyle": dash, "linewidth": 1.2, "marker": MARKERS[colour]}
+def _arguments(colour: str, dash: Any, marker: str) -> dict[str, Any]:
+    return {"color": colour, "linestyle": dash, "linewidth": 1.2, "marker": marker}
 
 
 def line(look: Mapping[str, Any]) -> dict[str, Any]:

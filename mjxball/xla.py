@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.errors import InputError
+from mjxball.files import user_cache
 from mjxball.terminal import warn
 
 # On CPUs a loop whose body touches fewer bytes than that becomes one function of LLVM's, instead of one for each
@@ -69,15 +70,12 @@ VARIABLE = "MJXBALL_CACHE"
 
 
 def cache_directory() -> Path | None:
-    """Where compiled programs are kept: $MJXBALL_CACHE, else the user's cache directory; None if it is `off`."""
+    """Where compiled programs are kept: $MJXBALL_CACHE, else in `user_cache`; None if it is `off` or there is none."""
     chosen = os.environ.get(VARIABLE)
     if chosen is not None:
         return None if chosen.lower() in ("", "off", "0") else Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME")
-    try:
-        return (Path(base) if base else Path.home() / ".cache") / "mjxball" / "jax"
-    except RuntimeError:  # whoever has no home directory
-        return None
+    place = user_cache()
+    return place and place / "jax"
 
 
 def traced_directory() -> Path | None:

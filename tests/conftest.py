@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import surroundings  # noqa: F401  (before JAX reads what it sets)
+
+# isort: split
 import atexit
 import contextlib
 import dataclasses
@@ -12,8 +15,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before the first import of JAX
 
 import hypothesis
 import jax

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import pwd
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from mjxball import xla
+from mjxball import files, xla
+from mjxball.fly import connection
 
 
 @pytest.mark.parametrize(
@@ -45,3 +47,26 @@ def test_cache_directory_can_be_chosen_or_switched_off(monkeypatch: pytest.Monke
     monkeypatch.delenv("MJXBALL_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert xla.cache_directory() == tmp_path / "mjxball" / "jax"
+
+
+def test_who_has_no_home_directory_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container that runs under a number without a name: neither $HOME nor an entry of passwd."""
+
+    def nobody(number: int) -> None:
+        raise KeyError(number)
+
+    for name in ("HOME", "MJXBALL_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", nobody)
+    assert files.user_cache() is None
+    assert xla.cache_directory() is None
+    assert connection.table_cache() is None
+
+
+def test_a_home_directory_that_cannot_be_written_keeps_no_tables(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "file" / "below"))
+    (tmp_path / "file").touch()
+    assert connection.table_cache() is None

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjxball.arrays import matmul
 from mjxball.config import Config
 from mjxball.control.network import Network
 
@@ -56,8 +57,8 @@ class PolicyNetwork(NamedTuple):
         names = sorted(self.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
         hidden = (observation - self.mean) / self.deviation * self.mask
         for name in names[:-1]:
-            hidden = jax.nn.relu(hidden @ self.layers[name]["kernel"] + self.layers[name]["bias"])
-        last = hidden @ self.layers[names[-1]]["kernel"] + self.layers[names[-1]]["bias"]
+            hidden = jax.nn.relu(matmul(hidden, self.layers[name]["kernel"]) + self.layers[name]["bias"])
+        last = matmul(hidden, self.layers[names[-1]]["kernel"]) + self.layers[names[-1]]["bias"]
         return jnp.tanh(last[..., : last.shape[-1] // 2])
 
 

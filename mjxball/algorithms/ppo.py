@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from mjxball.algorithms.recurrent import RecurrentPolicy, answer
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
 from mjxball.quiet import import_brax_ppo, import_brax_training
+
+if TYPE_CHECKING:
+    from jaxtyping import Int
 
 brax = import_brax_training()
 brax_ppo = import_brax_ppo()
@@ -117,8 +120,7 @@ class ProximalPolicyOptimization:
         ppo, count = self._config, self._environments.count
         rate = ppo.learning_rate * (1.0 + (FINAL_RATE - 1.0) * progress)
         order_key, loss_key = jax.random.split(self._shards.own(keys[0]))
-        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(order_key, EPOCHS))
-        batches = orders.reshape(EPOCHS * ppo.minibatches, -1)
+        batches = _orders(order_key, count).reshape(EPOCHS * ppo.minibatches, -1)
 
         def loss(parameters: Any, batch: Any, key: Array) -> tuple[Array, dict[str, Array]]:
             return brax_ppo.losses.compute_ppo_loss(
@@ -193,6 +195,17 @@ def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) ->
         ),
         parametric_action_distribution=distribution,
     )
+
+
+def _orders(key: Array, count: int) -> Int[Array, "epochs envs"]:
+    """The numbers below `count` in random orders.
+
+    Each is the low bits of a random number. `jax.random.permutation` sorts keys with their values, and a sort of two
+    arrays on several devices is what XLA's partitioner ends the process by (`HandleSort`, jax 0.10.1 and 0.11.2).
+    """
+    low = jnp.uint32((1 << (count - 1).bit_length()) - 1)
+    bits = jax.random.bits(key, (EPOCHS, count), jnp.uint32)
+    return (jnp.sort(bits & ~low | jnp.arange(count, dtype=jnp.uint32), axis=-1) & low).astype(jnp.int32)
 
 
 def _rollout(seen: Transition, parameters: Array, raw: Array, likely: Array) -> Any:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 from mjxball.config import Config
 from mjxball.control import leader, rotations
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -88,12 +88,12 @@ class AssemblyModel(NamedTuple):
             for part in (self.effect, self.inverse_cost, self.kp, self.asked_per_wrench)
         )
         if thrust is None:
-            asked = (asked_per_wrench @ wrench[..., None, :, None])[..., 0]
+            asked = matmul(asked_per_wrench, wrench[..., None, :, None])[..., 0]
         else:
             effect = self.of_followers(thrust)[..., None, None] * effect
-            whole = (effect @ (inverse_cost[..., None] * effect.mT)).sum(axis=-3)
+            whole = matmul(effect, inverse_cost[..., None] * effect.mT).sum(axis=-3)
             price = xp.linalg.solve(whole, wrench[..., None])
-            asked = inverse_cost * (effect.mT @ price[..., None, :, :])[..., 0]
+            asked = inverse_cost * matmul(effect.mT, price[..., None, :, :])[..., 0]
         vertical = asked[..., 0] / self.of_followers(carried)
         return xp.concat([asked[..., 1:] / kp, vertical[..., None]], axis=-1)
 

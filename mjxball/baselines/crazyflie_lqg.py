@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
 from mjxball.baselines.lqg_design import discretise
 from mjxball.config import Config, ball_limit
@@ -163,12 +163,12 @@ class CrazyflieLqg:
         """See `Law.step`."""
         xp = observation.__array_namespace__()
         transition, drive, gain, feedback = (xp.asarray(part, dtype=observation.dtype) for part in self._design)
-        predicted = state.estimate @ transition.T + state.command @ drive.T
+        predicted = matmul(state.estimate, transition.T) + matmul(state.command, drive.T)
         predicted = xp.where(state.started[..., None] > 0, predicted, state.estimate)
         expected = xp.stack([predicted[..., k] for k in self._model.indices(MEASURED)], axis=-1)
-        estimate = _clip(predicted + (self._measured(observation) - expected) @ gain.T, self._state_bounds)
+        estimate = _clip(predicted + matmul(self._measured(observation) - expected, gain.T), self._state_bounds)
         near = _clip(estimate, self._error_bounds)  # the motors have little to spare for a far goal
-        change = -xp.concat([near, state.command], axis=-1) @ feedback.T
+        change = -matmul(xp.concat([near, state.command], axis=-1), feedback.T)
         command = _clip(state.command + change, self._limits)
         integral, copied = self._pid.step(state.integral, observation)
         vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))

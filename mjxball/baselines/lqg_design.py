@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 from mjxball.baselines.assembly_model import AssemblyModel
 
 TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
@@ -52,9 +52,9 @@ def filtered(kalman: Filter, estimate: Array, drive: Array, measured: Array, sta
     """
     xp = measured.__array_namespace__()
     transition, enters, gain = (xp.asarray(part, dtype=measured.dtype) for part in kalman)
-    predicted = (transition @ estimate[..., None])[..., 0] + drive[..., None] * enters
+    predicted = matmul(transition, estimate[..., None])[..., 0] + drive[..., None] * enters
     predicted = xp.where(started > 0, predicted, estimate)
-    return predicted + (gain @ (measured - predicted[..., :2])[..., None])[..., 0]
+    return predicted + matmul(gain, (measured - predicted[..., :2])[..., None])[..., 0]
 
 
 def feedback(model: AssemblyModel, tuning: Tuning) -> Gains:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 from mjxball.baselines.assembly_model import pair_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, THETA_NOISE, Tuning, feedback, steady_filter
@@ -91,10 +91,10 @@ class OffsetFree:
     def estimate(self, state: Array, observation: Array) -> Array:
         """The filter's state (..., 8) at `observation`."""
         xp = observation.__array_namespace__()
-        predicted = state @ xp.asarray(self.design.transition.T, dtype=observation.dtype)
+        predicted = matmul(state, xp.asarray(self.design.transition.T, dtype=observation.dtype))
         expected = joined([predicted[..., 0], predicted[..., 1], predicted[..., 5]])
         left = joined(_measured(observation)) - expected
-        return predicted + left @ xp.asarray(self.design.gain.T, dtype=observation.dtype)
+        return predicted + matmul(left, xp.asarray(self.design.gain.T, dtype=observation.dtype))
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
         """See `Law.step`.

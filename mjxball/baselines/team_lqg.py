@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, Tuning, feedback, steady_filter
@@ -135,7 +135,7 @@ class TeamOffsetFree:
         for number in (0, 1):
             predicted = state[..., number * ANGLE_STATES : (number + 1) * ANGLE_STATES]
             left = joined([found[number] - predicted[..., 0], found[2 + number] - predicted[..., 1]])
-            parts.append(predicted + left @ gain.T)
+            parts.append(predicted + matmul(left, gain.T))
         predicted = state[..., 2 * ANGLE_STATES :]
         return joined(parts, axis=-2), predicted + (found[4] - predicted[..., 0])[..., None] * rising
 
@@ -148,8 +148,8 @@ class TeamOffsetFree:
         mean = (own + (ratio - 1.0) * led) / ratio
         drive = mean[..., :2] + xp.asarray(self.team.lever, dtype=dtype) * (own - led)[..., 2:]
         axis, height = (xp.asarray(part, dtype=dtype).T for part in (self.design.axis, self.design.height))
-        angles = [xp.concat([turning[..., k, :], drive[..., k : k + 1]], axis=-1) @ axis for k in (0, 1)]
-        climbing = xp.concat([rising, mean[..., 2:]], axis=-1) @ height
+        angles = [matmul(xp.concat([turning[..., k, :], drive[..., k : k + 1]], axis=-1), axis) for k in (0, 1)]
+        climbing = matmul(xp.concat([rising, mean[..., 2:]], axis=-1), height)
         return xp.concat([*angles, climbing], axis=-1), clip_command(own, *self._leader[-2:])
 
     def _command(self, turning: Array, rising: Array, led: Array, observation: Array) -> Array:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import importlib.util
 import os
+import shutil
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,9 @@ from mjxball.train.run_directory import (
     versions,
 )
 from mjxball.xla import compile_small_loops_whole
+
+# What a run imports once it has begun: some of it after hours.
+LATE_IMPORTS = ("tensorboardX", "orbax.checkpoint", "mujoco", "scipy", "matplotlib", "jinja2")
 
 
 def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
@@ -72,6 +78,30 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     if extensions:
         origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
+
+
+def check_packages() -> None:
+    """Raise ModuleNotFoundError if a package is missing of which a run would know late."""
+    for name in LATE_IMPORTS:
+        if importlib.util.find_spec(name) is None:
+            package = name.partition(".")[0]
+            raise ModuleNotFoundError(f"{package} is not installed", name=package)
+
+
+@contextlib.contextmanager
+def emptied_unless_begun(out: Path, errors: type[Exception] | tuple[()]) -> Iterator[Callable[[], None]]:
+    """Gives what is to be called when training begins; one of `errors` before that leaves nothing in the new `out`.
+
+    The same command can then be given again, when what it lacked is there.
+    """
+    begun = threading.Event()
+    try:
+        yield begun.set
+    except errors:
+        if not begun.is_set():
+            for place in (place for place in out.glob("*") if place.name != LOCK):
+                shutil.rmtree(place) if place.is_dir() else place.unlink()
+        raise
 
 
 def output_directory(out: Path) -> Path:

@@ -18,7 +18,15 @@ import numpy as np
 from mjxball import cli, config
 from mjxball.algorithms import ALGORITHMS
 from mjxball.commands.compare import compare, compare_members, compile_ahead, is_evaluated
-from mjxball.commands.new_run import new_run, output_directory, recorded, refuse_beside, wake_devices
+from mjxball.commands.new_run import (
+    check_packages,
+    emptied_unless_begun,
+    new_run,
+    output_directory,
+    recorded,
+    refuse_beside,
+    wake_devices,
+)
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
 from mjxball.evaluate.scenarios import rig_line
@@ -121,6 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _train(options: argparse.Namespace, command: str) -> int:
     meeting, started = _meeting(options), time.monotonic()
+    check_packages()
     if options.gather is not None:
         return _gather(options)
     check_address_space()
@@ -143,9 +152,13 @@ def _train(options: argparse.Namespace, command: str) -> int:
         with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
             hold.enter_context(processes.holding(out, meeting is not None, check))
             writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
+            # Of several processes one that is lost is no refusal: they go on by --resume.
+            undone = () if resume or not writes else InputError if meeting else Exception
+            begun = hold.enter_context(emptied_unless_begun(out, undone))
             with ThreadPoolExecutor(1) as beside:
 
                 def prepare() -> None:
+                    begun()
                     if writes and options.plant:
                         warn(rig_line(settings))
                     if writes and is_evaluated(origin):

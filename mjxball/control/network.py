@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 
 
 def gru_cell(hidden: Array, seen: Array, kernel: Array, recurrent: Array, bias: Array) -> Array:
@@ -21,7 +21,7 @@ def gru_cell(hidden: Array, seen: Array, kernel: Array, recurrent: Array, bias: 
     gate of 1 keeps the state.
     """
     xp, size = hidden.__array_namespace__(), hidden.shape[-1]
-    given, kept = seen @ kernel + bias, hidden @ recurrent
+    given, kept = matmul(seen, kernel) + bias, matmul(hidden, recurrent)
     # The logistic function as a hyperbolic tangent, which does not overflow.
     gates = 0.5 + 0.5 * xp.tanh(0.5 * (given[..., : 2 * size] + kept[..., : 2 * size]))
     reset, update = gates[..., :size], gates[..., size:]
@@ -60,10 +60,10 @@ class Network(NamedTuple):
     def _head(self, below: Array, hidden: Array | None = None) -> Array:
         xp = below.__array_namespace__()
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            below = xp.maximum(below @ weight + bias, 0.0)
+            below = xp.maximum(matmul(below, weight) + bias, 0.0)
         if hidden is not None:
             below = xp.concat([below, hidden], axis=-1)
-        return below @ self.weights[-1] + self.biases[-1]
+        return matmul(below, self.weights[-1]) + self.biases[-1]
 
     def like(self, seen: Array) -> Network:
         """The same with arrays of the namespace and dtype of `seen`."""

@@ -108,8 +108,7 @@ class Batch:
         inputs = Inputs(
             np.arange(count + 1, dtype=np.int32), (goals[:-1], goals[1:]), force, later._replace(force=None)
         )
-        with jax.default_matmul_precision("highest"):
-            return self._program(sensors, delays, keeps)(start, load, most, goals[0], samples.at(0), inputs)
+        return self._program(sensors, delays, keeps)(start, load, most, goals[0], samples.at(0), inputs)
 
     def _program(self, sensors: SensorModel, delays: np.ndarray, keeps: bool) -> Any:
         """The compiled flight; delays, biases and resolutions are constants in it, everything else is given to it."""

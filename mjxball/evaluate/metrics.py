@@ -63,15 +63,8 @@ class RunningMetrics(NamedTuple):
     steps: Array  # ()
     time: Array  # () of the last step [s]
     early: Array  # () steps within the first 20 s
-    square: Array  # sum of |e_o|^2 over them
-    difference: Array
-    returned: Array
-    effort: Array
-    change: Array
-    saturated: Array
-    limited: Array
-    power: Array
-    spread: Array
+    sums: Array  # (n, 9) over the steps of what `_taken` says
+    excess: Array  # (n, 9) what rounding has added to them: it may always round the same way
     failed: Array
     initial: Array  # |e_o| at the start of the leg [m]
     leg: Array  # when the last waypoint became the goal [s]
@@ -95,7 +88,8 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
     no_peaks = xp.concat([none, none[:, :1]], axis=-1)
     scalar = xp.sum(zero[:0])
     return RunningMetrics(
-        *(scalar, scalar, scalar, zero, zero, zero, zero, zero, zero, zero, zero, zero),
+        *(scalar, scalar, scalar),
+        *(xp.stack([zero] * 9, axis=-1),) * 2,  # sums, excess
         zero > 1,
         initial=_norm(target - position),
         leg=zero,
@@ -132,30 +126,13 @@ def update(
     peaks = xp.where(new[:, None], xp.nan, running.peaks)
     steady = tick.time >= steady_from - TINY
     errors = xp.concat([xp.abs(error), xp.hypot(error[:, :1], error[:, 1:2])], axis=-1)
-    rotors = _of_followers(tick.rotor_force, leader)
-    led, followed = tick.leader_command[:, None], xp.reshape(tick.follower_command, (*rotors.shape[:2], 3))
-    tilts, difference = followed[..., :2], followed - led
-    most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
-    most = xp.broadcast_to(most, tick.rotor_force.shape[:-1])[..., None]
-    saturated = _of_followers(near_limit(SATURATED_WITHIN, tick.rotor_force, most), leader)
-    limited = xp.max(near_limit(AT_LIMIT_WITHIN, tick.rotor_force, most), axis=(-2, -1))
-    early = tick.time <= RMSE_UNTIL + TINY
-    mimicry = xp.mean(paper_reward(led, followed), axis=-1)
-    change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
-    apart = tilts - xp.mean(tilts, axis=-2, keepdims=True)
+    sums, excess = compensated_sum(running.sums, running.excess, _taken(running, tick, rotor_force_max, leader))
     return RunningMetrics(
         steps=running.steps + 1,
         time=running.time * 0 + tick.time,
-        early=running.early + xp.where(early, 1.0, 0.0),
-        square=running.square + xp.where(early, distance**2, 0.0),
-        difference=running.difference + xp.mean(difference**2, axis=(-2, -1)),
-        returned=running.returned + xp.where(running.steps < PAPER_STEPS, mimicry, 0.0),
-        effort=running.effort + xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
-        change=running.change + xp.where(running.steps > 0, change, 0.0),
-        saturated=running.saturated + xp.mean(saturated, axis=(-2, -1)),
-        limited=running.limited + limited,
-        power=running.power + power_of(tick.rotor_force),
-        spread=running.spread + xp.mean(apart**2, axis=(-2, -1)),
+        early=running.early + xp.where(tick.time <= RMSE_UNTIL + TINY, 1.0, 0.0),
+        sums=sums,
+        excess=excess,
         failed=running.failed | tick.diverged | ~(distance <= termination_distance),
         initial=initial,
         leg=xp.where(new, tick.time, running.leg),
@@ -167,14 +144,47 @@ def update(
         tilt=xp.fmax(running.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
         hover=running.hover,
         hover_power=running.hover_power,
-        tilts=tilts,
+        tilts=xp.reshape(tick.follower_command, (*running.hover.shape[:2], 3))[..., :2],
         target=tick.target,
     )
+
+
+def _taken(running: RunningMetrics, tick: Tick, rotor_force_max: Array | float, leader: int) -> Array:
+    """What one control step adds to `RunningMetrics.sums` (n, 9)."""
+    xp = tick.position.__array_namespace__()
+    rotors = _of_followers(tick.rotor_force, leader)
+    led, followed = tick.leader_command[:, None], xp.reshape(tick.follower_command, (*rotors.shape[:2], 3))
+    tilts = followed[..., :2]
+    most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
+    most = xp.broadcast_to(most, tick.rotor_force.shape[:-1])[..., None]
+    saturated = _of_followers(near_limit(SATURATED_WITHIN, tick.rotor_force, most), leader)
+    change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
+    apart = tilts - xp.mean(tilts, axis=-2, keepdims=True)
+    taken = (
+        xp.where(tick.time <= RMSE_UNTIL + TINY, _norm(tick.target - tick.position) ** 2, 0.0),
+        xp.mean((followed - led) ** 2, axis=(-2, -1)),
+        xp.where(running.steps < PAPER_STEPS, xp.mean(paper_reward(led, followed), axis=-1), 0.0),
+        xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
+        xp.where(running.steps > 0, change, 0.0),
+        xp.mean(saturated, axis=(-2, -1)),
+        xp.max(near_limit(AT_LIMIT_WITHIN, tick.rotor_force, most), axis=(-2, -1)),
+        power_of(tick.rotor_force),
+        xp.mean(apart**2, axis=(-2, -1)),
+    )
+    return xp.stack(taken, axis=-1)
+
+
+def compensated_sum(total: Array, excess: Array, value: Array) -> tuple[Array, Array]:
+    """(`total` + `value`, what rounding has added to it so far), given `excess`, the latter before (Kahan 1965)."""
+    lacking = value - excess
+    summed = total + lacking
+    return summed, (summed - total) - lacking
 
 
 def results(running: RunningMetrics) -> list[Metrics]:
     """Metrics of every flight."""
     t = RunningMetrics(*(np.asarray(leaf, float) for leaf in running))
+    square, difference, returned, effort, change, saturated, limited, power, spread = (t.sums - t.excess).T
     with np.errstate(invalid="ignore", divide="ignore"):
         peaks = np.where((t.steady > 1)[:, None], t.peaks, np.nan)
         goal = np.where(t.target == 0, np.nan, t.target)
@@ -182,7 +192,7 @@ def results(running: RunningMetrics) -> list[Metrics]:
         settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
         settled = np.where(t.outside >= t.time - NEVER_WITHIN - ROUNDING, np.nan, settled)
         columns = {
-            "rmse": np.sqrt(t.square / t.early),
+            "rmse": np.sqrt(square / t.early),
             "settling_time": settled[:, 0],
             "overshoot": np.fmax.reduce(over, axis=1) - 1,
             "x_peak": peaks[:, 0],
@@ -190,15 +200,15 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "z_peak": peaks[:, 2],
             "plane_peak": peaks[:, 3],
             "max_tilt": t.tilt,
-            "action_error": np.sqrt(t.difference / t.steps),
+            "action_error": np.sqrt(difference / t.steps),
             "settling_time_10": settled[:, 1],
-            "paper_return": t.returned,
-            "effort": np.sqrt(t.effort / t.steps),
-            "smoothness": np.sqrt(t.change / max(t.steps - 1, 1)),
-            "saturation": t.saturated / t.steps,
-            "rotors_at_limit": t.limited / t.steps,
-            "rotor_power": t.power / t.steps / t.hover_power,
-            "command_spread": np.sqrt(t.spread / t.steps) if t.hover.shape[1] > 1 else t.spread * np.nan,
+            "paper_return": returned,
+            "effort": np.sqrt(effort / t.steps),
+            "smoothness": np.sqrt(change / max(t.steps - 1, 1)),
+            "saturation": saturated / t.steps,
+            "rotors_at_limit": limited / t.steps,
+            "rotor_power": power / t.steps / t.hover_power,
+            "command_spread": np.sqrt(spread / t.steps) if t.hover.shape[1] > 1 else spread * np.nan,
         }
     rows = zip(*columns.values(), strict=True)
     named = (dict(zip(columns, map(_number, row), strict=True)) for row in rows)

@@ -103,8 +103,7 @@ def fly(
 
     keys = jax.random.split(jax.random.key(seed), (rigs.total, flights))
     single = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (rigs, numbers))
-    with jax.default_matmul_precision("highest"):
-        error, failed, effort = jax.tree.map(np.asarray, jax.jit(jax.vmap(rig_flights))(*single, keys))
+    error, failed, effort = jax.tree.map(np.asarray, jax.jit(jax.vmap(rig_flights))(*single, keys))
     return Flown(error, failed, effort)
 
 

@@ -13,15 +13,14 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import struct
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mjxball.errors import InputError
+from mjxball.files import user_cache
 from mjxball.fly import clock
 from mjxball.fly.packets import Packet
 from mjxball.fly.process import bounded
@@ -53,8 +52,10 @@ class Identity:
 
 def table_cache() -> str | None:
     """Directory for the tables of contents of firmwares, one file each; None if there can be none."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    place = (Path(base) if base else Path.home() / ".cache") / "mjxball" / "crazyflie"
+    above = user_cache()
+    if above is None:
+        return None
+    place = above / "crazyflie"
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError:

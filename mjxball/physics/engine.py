@@ -14,7 +14,7 @@ from mjxball.plant import PlantParameters, parts
 from mjxball.plant.parameters import of_drone, own_inertia, shared
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     Scalar = Float[Array, "..."]
     # Of the load along its directions: (...) on a line, (..., 2) in a plane.
@@ -32,7 +32,8 @@ class PlantState(NamedTuple):
     velocity: Vector  # of O in the world [m/s]
     rates: Vector  # angular velocity in body axes [rad/s]
     rotor_force: Float[Array, "... drones 4"]  # [N]
-    time: Scalar  # since the start of the episode [s]
+    ticks: Int[Array, "..."]  # halves of a physics step since the start of the episode
+    time: Scalar  # their number times their length [s]: a sum of them in float32 is 2 s off after half an hour
     ball_offset: Coordinates  # of a rolling ball from O [m]; unused by prescribed motions
     ball_rate: Coordinates  # [m/s]
     loops: Float[Array, "... drones 13"] | None = None  # of a Crazyflie, see `control.crazyflie`; None: ideal

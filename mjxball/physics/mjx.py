@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjxball.arrays import matmul
 from mjxball.assembly import ASSEMBLY, BALL, build_model, drone_names
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
@@ -54,8 +55,8 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
         n, slides = stages.root, range(stages.slides)
         driven = _solve(mass[:n, :n], stages.applied(state, wrench) - bias[:n])
         recoils = [_solve(mass[:n, :n], -mass[:n, n + k]) for k in slides]
-        driving = [pushed[k] - bias[n + k] - mass[n + k, :n] @ driven for k in slides]
-        inertia = [[mass[n + i, n + j] + mass[n + i, :n] @ recoils[j] for j in slides] for i in slides]
+        driving = [pushed[k] - bias[n + k] - matmul(mass[n + k, :n], driven) for k in slides]
+        inertia = [[mass[n + i, n + j] + matmul(mass[n + i, :n], recoils[j]) for j in slides] for i in slides]
         ball = parts.solve_small(inertia, driving)
         for acceleration, recoil in zip(ball, recoils, strict=True):
             driven = driven + acceleration * recoil
@@ -102,8 +103,9 @@ class _Stages:
         model = self._loaded(object_mass, dtype)
         data = self._blank.replace(qpos=jnp.concatenate([*position, offset]), qvel=jnp.concatenate([*velocity, rate]))
         mjx = self._mjx
-        for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne):
-            data = stage(model, data)
+        with jax.default_matmul_precision("highest"):  # see `arrays.matmul`
+            for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne):
+                data = stage(model, data)
         mass, bias = _mass_matrix(model, data), data.qfrc_bias
         return (mass, bias) if added is None else self._spun(state, mass, bias, added)
 

@@ -197,6 +197,7 @@ def start_state(
         velocity=velocity,
         rates=xp.zeros_like(velocity),
         rotor_force=hover_rotor_force(config, believed_mass, parameters),
+        ticks=xp.zeros_like(position[..., 0], dtype=xp.int32),
         time=xp.zeros_like(position[..., 0]),
         ball_offset=ball_offset,
         ball_rate=xp.zeros_like(ball_offset),
@@ -204,10 +205,12 @@ def start_state(
 
 
 def _drift(state: PlantState, h: float) -> PlantState:
+    ticks = state.ticks + 1
     return state._replace(
         position=state.position + h * state.velocity,
         quaternion=rotations.integrate_quaternion(state.quaternion, h * state.rates),
-        time=state.time + h,
+        ticks=ticks,
+        time=h * ticks.__array_namespace__().astype(ticks, state.time.dtype),
         ball_offset=state.ball_offset + h * state.ball_rate,
     )
 

@@ -14,6 +14,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from command_line import (
@@ -32,8 +33,11 @@ from tables import rows
 
 from mjxball import cli, export
 from mjxball import config as configs
+from mjxball.commands.new_run import LATE_IMPORTS
 from mjxball.commands.train import main, parser
+from mjxball.errors import InputError
 from mjxball.policy import Policy
+from mjxball.train.population import Population
 
 ROW = re.compile(r"^\s*[\d,]+ steps")
 COMPILING = re.compile("compiling the training program")
@@ -258,6 +262,36 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "note.txt").write_text("a note")
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def test_a_missing_package_is_missed_before_anything_is_written(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that a run would import late, some of them hours after it began."""
+    for name in LATE_IMPORTS:
+        with monkeypatch.context() as without:
+            without.setitem(sys.modules, name, None)
+            said = assert_refused(main, [*tiny(), "--out", "run"], here, capsys)
+        assert f"{name.partition('.')[0]} is not installed" in said
+        assert "mjxball[train]" in said
+
+
+def test_a_start_that_fails_leaves_nothing(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same command is then given again: config.json and metrics.csv had it refused for a directory in use."""
+    full = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: 9 TB")
+    for error in (InputError("no"), full, ModuleNotFoundError(name="rich")):
+
+        def compiled(*_: Any, error: Exception = error) -> None:
+            raise error
+
+        monkeypatch.setattr(Population, "compile", compiled)
+        for given in ("run", "unused/below"):
+            before = listing(here)
+            assert main([*tiny(), "--out", given]) == 2
+            assert listing(here) == before
+            assert "is not empty" not in capsys.readouterr().err
 
 
 @rows("arguments", BAD_ARGUMENTS.values())

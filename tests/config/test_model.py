@@ -119,6 +119,7 @@ def test_a_rig_flies_as_mujoco_steps_its_model(tmp_path: Path) -> None:
         np.zeros(3),
         np.zeros(3),
         force,
+        np.int64(0),
         np.float64(0),
         np.float64(0),
         np.float64(0),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjxball.config import preset
-from mjxball.evaluate.metrics import Metrics, measure, measure_batch, rotor_limits
-from mjxball.sim.rollout import Trajectory
+from mjxball.evaluate.metrics import Metrics, begin, measure, measure_batch, results, rotor_limits, update
+from mjxball.sim.rollout import Tick, Trajectory
 from mjxball.sim.scenario import Scenario
 
 TIME = np.arange(1501) * 0.02  # 30 s
@@ -50,6 +52,19 @@ def approach(rate: float = 1.0) -> np.ndarray:
 
 def of(trajectory: Trajectory) -> Metrics:
     return measure(trajectory, termination_distance=2.5)
+
+
+def test_means_of_ten_minutes_of_equal_steps_in_float32() -> None:
+    """Rounding always the same way adds up: the mean power was 0.04 % off, that of a day 2.4 %."""
+    steps, force, zero = round(600 / 0.02), jnp.full((1, 2, 4), 0.6419), jnp.zeros((1, 3))
+    tick = Tick(jnp.zeros(()), zero, zero, zero, force, zero, jnp.full((1, 3), 0.0123), jnp.zeros(1, bool))
+    running = begin(zero, zero, jnp.full((1, 2, 4), 0.63))
+    later = jax.jit(lambda given: jax.lax.fori_loop(0, steps, lambda _, one: update(one, tick, 2.5, 5.5), given))
+    found = results(later(running))[0]
+    # 1e-6: eight roundings of 6e-8 each in one step.
+    assert found.rotor_power == pytest.approx((0.6419 / 0.63) ** 1.5, rel=1e-6)
+    assert found.action_error == pytest.approx(0.0123, rel=1e-6)
+    assert found.effort == pytest.approx(0.0119, rel=1e-5)  # a difference of larger numbers
 
 
 def test_exponential_approach() -> None:

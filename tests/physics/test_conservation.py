@@ -31,7 +31,8 @@ def derivative(engine: Engine, mass: np.ndarray, path: Callable, sines: tuple, s
     spin = np.concatenate([np.zeros((WORLDS, 1)), state.rates], axis=-1)
     turn = rotations.multiply_quaternions(state.quaternion, spin) / 2
     still = np.zeros(WORLDS)
-    return PlantState(state.velocity, turn, linear, angular, 0 * state.rotor_force, np.ones(WORLDS), still, still)
+    motor = 0 * state.rotor_force
+    return PlantState(state.velocity, turn, linear, angular, motor, still, np.ones(WORLDS), still, still)
 
 
 def advance(state: PlantState, rate: PlantState, h: float) -> PlantState:
@@ -100,6 +101,7 @@ def test_free_fall_conserves_momentum(plant: Plant, make_engine: object) -> None
         velocity=random.normal(size=(WORLDS, 3)),
         rates=rates,
         rotor_force=np.zeros((WORLDS, plant.count, 4)),
+        ticks=np.zeros(WORLDS, int),
         time=np.zeros(WORLDS),
         ball_offset=np.zeros(WORLDS),
         ball_rate=np.zeros(WORLDS),
@@ -130,9 +132,8 @@ def test_objects_own_equations_hold_with_the_contact_wrenches(physics: str) -> N
     plant, constants = config.plant, plant_parameters(config.plant, config.attitude)
     flight = simulate(config, copying(config), Scenario(omega=2.0, amplitude=0.1, mass=0.3, seconds=4.0), physics)
     matrix = rotations.matrix_from_quaternion(flight.quaternion)
-    state = PlantState(
-        flight.position, flight.quaternion, flight.velocity, flight.rates, flight.rotor_force, flight.time, *[None] * 2
-    )
+    flown = (flight.position, flight.quaternion, flight.velocity, flight.rates, flight.rotor_force)
+    state = PlantState(*flown, None, flight.time, None, None)
     from mjxball.physics.engine import total_wrench
 
     ones = np.ones_like(flight.time)

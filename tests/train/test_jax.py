@@ -19,7 +19,7 @@ from mjxball import cli, entry
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.train import compilation, train
-from mjxball.xla import cache_directory, enable_compilation_cache
+from mjxball.xla import enable_compilation_cache
 
 SMALL = {
     "timing.episode_steps": 100,
@@ -130,16 +130,6 @@ def test_a_cache_of_another_user_is_a_warning(
         monkeypatch.setenv("MJXBALL_CACHE", str(tmp_path / "file" / "below"))  # no directory can be made there
         assert enable_compilation_cache() is None
         assert "cannot be written" in capsys.readouterr().err
-
-
-def test_who_has_no_home_directory_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    def homeless() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("MJXBALL_CACHE", raising=False)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(Path, "home", homeless)
-    assert cache_directory() is None
 
 
 def test_a_cache_that_refuses_files_is_gone_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,66 @@
+"""Populations of every algorithm on two devices, which XLA partitions: two of a CPU, in a process of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from command_line import HASTY, REPOSITORY
+
+from mjxball.algorithms import ALGORITHMS
+from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.train.extensions import find
+
+TINY = {
+    **{"sac.num_envs": 4, "sac.replay_size": 160, "sac.warmup_steps": 80, "sac.batch_size": 16},
+    **{"sac.updates_per_step": 1, "sac.policy_layers": (8,), "sac.critic_layers": (8,)},
+    **{"ppo.num_envs": 8, "ppo.minibatches": 2, "ppo.unroll_length": 4, "ppo.policy_layers": (8,)},
+    **{"gradient.num_envs": 4, "gradient.horizon": 4, "gradient.policy_layers": (8,), "timing.episode_steps": 8},
+}
+CODE = f"""
+import sys
+import jax, numpy as np
+from mjxball import config as configs
+from mjxball.algorithms import ALGORITHMS
+from mjxball.train import program as programs
+from mjxball.train.extensions import Extensions, resolve
+from mjxball.train.population import Population
+from mjxball.train.stretch import advance
+tiny = configs.preset("transport")
+for name, value in {TINY!r}.items():
+    tiny = configs.replace(tiny, name, value)
+for algorithm in ALGORITHMS:
+    for units in (0, 4):
+        config = configs.replace(tiny, "follower.recurrent_units", units)
+        extensions = resolve(Extensions(algorithm=ALGORITHMS[algorithm]))
+        if sys.argv[1] not in extensions.algorithm.engines:
+            continue
+        population = Population(config, sys.argv[1], 2, extensions=extensions)
+        assert population.devices == jax.local_device_count() == 2
+        compiled = population.compile(creating=True)
+        state = population.start(compiled, 5)
+        for mode in (programs.warmup, programs.train, programs.train, programs.evaluate):
+            state, *_ = advance(population, compiled, state, mode(20))
+        floats = [leaf for leaf in jax.tree.leaves(state.algorithm) if leaf.dtype == np.float32]
+        assert all(len(leaf.sharding.device_set) == 2 for leaf in floats)
+        assert all(np.isfinite(np.asarray(leaf)).all() for leaf in floats)
+        assert any(not np.array_equal(*np.asarray(leaf)) for leaf in floats)  # two members
+        print(algorithm, units, "trained", flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", TRAINING_ENGINES)
+def test_every_algorithm_trains_two_members_on_two_devices(engine: str) -> None:
+    """PPO ended the process in XLA's partitioner, exit code 134."""
+    flags = f"{HASTY} --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", CODE, engine]
+    done = subprocess.run(
+        command, check=False, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    algorithms = [name for name in ALGORITHMS if engine in find(name, "--algorithm").engines]
+    assert done.stdout.splitlines() == [f"{name} {units} trained" for name in algorithms for units in (0, 4)]
