@@ -36,7 +36,6 @@ def _has_mask(given: Any) -> bool:
 
 def matmul(a: Array, b: Array) -> Array:
     """`a @ b` in the precision of its arrays. JAX's own `@` rounds float32 on GPUs, to 10 bits (TF32) since Ampere."""
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return a @ b
-    xp = (b if isinstance(a, np.ndarray) else a).__array_namespace__()
+    other = b if isinstance(a, np.ndarray) else a
+    xp = other.__array_namespace__() if hasattr(other, "__array_namespace__") else np
     return xp.matmul(a, b, precision="highest") if xp.__name__ == "jax.numpy" else a @ b

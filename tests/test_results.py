@@ -233,8 +233,13 @@ def silent_uplink() -> Numbers:
 
 
 def drawn_apart() -> Numbers:
-    found = dict(minutes())
-    return [found[name][part] for name in ("team3", "team4", "team6") for part in (2, 1)]
+    rows = [row for row in measured("horizon")["rows"] if row["seconds"] == 600]
+    return [
+        max(row[part + when] for row in rows if row["plant"] == name)
+        for when in ("", "_at_end")
+        for name in ("team3", "team4", "team6")
+        for part in ("command_spread", "rotor_power")
+    ]
 
 
 SAID: tuple[tuple[str, str, Callable[[], Numbers]], ...] = (
@@ -243,7 +248,8 @@ SAID: tuple[tuple[str, str, Callable[[], Numbers]], ...] = (
     ("onboard", "Under # faults", lambda: [len({row["fault"] for row in measured("onboard_flights")["faults"]})]),
     (
         "followers",
-        "tilts are # rad apart in `team3` (power # of hover's), # in `team4` (#), # in `team6` (#)",
+        "tilts are # rad apart in `team3` (power # of hover's), # in `team4` (#), # in `team6` (#); in their last 20 s "
+        "# (#), # (#), # (#)",
         drawn_apart,
     ),
     ("followers", "of `mpc` among some # sets", lambda: [measured("mpc_tuning")["sets"]]),
