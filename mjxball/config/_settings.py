@@ -20,7 +20,11 @@ class Motion:
     )
     times: tuple[float, ...] = setting((), "waveform: increasing sample times [s]", low=-1e5, high=1e5, most=100_000)
     offsets: tuple[float, ...] = setting(
-        (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]", low=-1e4, high=1e4
+        (),
+        "waveform: CG offsets at those times, a C2 spline between, held outside [m]",
+        low=-1e4,
+        high=1e4,
+        most=100_000,
     )
     offsets_across: tuple[float, ...] = setting(
         (),

@@ -172,7 +172,7 @@ def test_a_plant_accelerates_as_mujoco_does_its_model(name: str, tmp_path: Path)
         data.qpos[3:], data.qvel[:] = [*quaternion, *offset], [*velocity, *rates, *rate]
         mujoco.mj_forward(model, data)
         force, ball = data.ctrl[motors], (offset, rate) if along > 1 else (offset[0], rate[0])
-        state = PlantState(np.zeros(3), quaternion, velocity, rates, force, np.float64(0), *ball)
+        state = PlantState(np.zeros(3), quaternion, velocity, rates, force, np.int32(0), np.float64(0), *ball)
         mass, push = np.float64(plant.object_mass), np.zeros_like(ball[0])
         found = engine.rolling(state, total_wrench(plant, numbers, force), mass, push, None)
         np.testing.assert_allclose(np.hstack(found), data.qacc, atol=1e-8 * np.abs(data.qacc).max())
@@ -375,7 +375,7 @@ BESIDE = {
     "rotors that are a word": ('rotors = "x"', "rotors must be a list of names or of places [x, y, z] in m, or"),
     "a flat rotor": ("rotors = [[0.1, 0]]", "rotors must be a list of names or of places [x, y, z] in m, or"),
     "a body that there is not": ("[rotors]\nx = [[0.1, 0, 0]]", "says rotors 'x', expected a site or body"),
-    "rotors at no place": ("rotors = [[nan, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]", "must be finite"),
+    "rotors at no place": ("rotors = [[nan, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]", "not nan"),
     "a rotor that there is not": ('rotors = ["x"]', "says rotors 'x', expected a site or body"),
     "a base": ('base = "pair"', "not base"),
     "drones that are none": ("[plant]\ndrones = [1, 2]", "a list of tables"),

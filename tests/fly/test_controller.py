@@ -114,8 +114,8 @@ def test_forgetting_starts_anew() -> None:
 
 def test_late_ticks_do_not_shift_the_later_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(process.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(process.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(process.clock, "now", lambda: now[0])
+    monkeypatch.setattr(process.clock, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     metronome = Metronome(0.01)
     metronome.start()
     times = []

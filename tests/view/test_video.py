@@ -75,7 +75,7 @@ def test_videos_that_cannot_be_are_refused(
         (["--video", "there.gif"], "exists"),
         (["--video", "nowhere/out.gif"], "does not exist"),
         (["--video", "out.gif", "--speed", "0"], "--speed must be"),
-        (["--video", "out.gif", "--speed", "nan"], "--speed must be"),
+        (["--video", "out.gif", "--speed", "-1"], "--speed must be"),
         (["--video", "out.gif", "--speed", "0.01"], "is too long"),
         (["--out", "page.html", "--speed", "2"], "--speed is of --video"),
         ([flights[1], "--save", "both.npz"], "--save writes one flight"),
