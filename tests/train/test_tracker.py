@@ -52,6 +52,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None) -
     (tmp_path / "my_tracker.py").write_text(OWN)
     (tmp_path / "leaving.py").write_text("raise SystemExit(0)")
     monkeypatch.delitem(sys.modules, "my_tracker", raising=False)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     return tmp_path
 
 
