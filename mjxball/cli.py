@@ -73,7 +73,7 @@ def _number(text: str, kind: type[float] | type[int]) -> float:
     with contextlib.suppress(ValueError):
         if is_number(number := kind(text)):
             return number
-    wanted = "a whole number" if kind is int else f"a number, 0 or from {SMALLEST:g} to {LARGEST:g} in size"
+    wanted = f"a whole number of at most {LARGEST:g}" if kind is int else f"a number, 0 or {SMALLEST:g} to {LARGEST:g}"
     raise argparse.ArgumentTypeError(f"takes {wanted}, not {shown(text)}")
 
 

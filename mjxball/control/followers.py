@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
-from threading import Thread, current_thread
+import threading
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -103,21 +102,24 @@ def check_batch(name: str, remembered: tuple[int, ...], observation: np.ndarray)
         )
 
 
+_OF_THREAD = threading.local()
+
+
 class OneThread:
     """The thread whose flight a follower remembers: the first that calls it after a reset.
 
     Two threads that call one follower by turns would each be answered from a mixture of both flights. A thread is known
-    by its object: its number is given to a later one when it has ended.
+    by an object of its own: its number, and what `threading` says of it, are given to a later one when it has ended.
     """
 
     def __init__(self) -> None:
-        self._of: dict[str, weakref.ref[Thread]] = {}
+        self._of: dict[str, object] = {}
 
     def check(self, name: str) -> None:
         """Raise RuntimeError if another thread has called follower `name` since its last reset."""
-        here = current_thread()
-        first = self._of.setdefault("flight", weakref.ref(here))  # atomic, so that of two first callers one is refused
-        if first() is not here:
+        here = _OF_THREAD.__dict__.setdefault("token", object())
+        # `setdefault` is atomic, so that of two first callers one is refused.
+        if self._of.setdefault("flight", here) is not here:
             raise RuntimeError(
                 f"follower {name} remembers a flight of another thread: give every thread its own (copy.copy), "
                 "reset it between flights, or keep the memory yourself (.law, which is pure)"

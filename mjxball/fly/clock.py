@@ -42,5 +42,5 @@ def sleep(seconds: float) -> None:
 def too_slow(why: str) -> str:
     """The sentence that ends a rehearsal which this computer cannot fly, because of `why`."""
     kept = "in real time" if _Pace.factor == 1 else f"even {_Pace.factor:g} times slower than real time"
-    offered = f"use --rehearse --slow {2 * _Pace.factor:g}, or leave it less to do"
-    return f"this computer is too slow for a rehearsal {kept}: {why}; {offered}"
+    slower = f"use --rehearse --slow {2 * _Pace.factor:g}, or " if 2 * _Pace.factor <= SLOWEST else ""
+    return f"this computer is too slow for a rehearsal {kept}: {why}; {slower}end other programs"

@@ -360,7 +360,7 @@ class Flight:
             share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
-        shares = self._lift.shared(share, seen, self.rig)
+        shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
         return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:

@@ -39,8 +39,9 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
 
     found = _files(path)
     unpacking = Unpacking(path, sum(file.stat().st_size for file in found))
-    with tempfile.TemporaryDirectory() as spare, unpacking.bounding():
+    with tempfile.TemporaryDirectory() as spare, contextlib.ExitStack() as stack:
         try:
+            stack.enter_context(unpacking.bounding())
             files = [_whole(_unpacked(file, Path(spare), unpacking), Path(spare), remark, unpacking) for file in found]
             with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 return _contents(path, reader, unpacking)

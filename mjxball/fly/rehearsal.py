@@ -9,15 +9,11 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import json
-import math
 import os
-import select
 import threading
 from collections.abc import Sequence
 from typing import Any
 
-from mjxball import terminal
 from mjxball.errors import InputError
 from mjxball.fly import clock
 from mjxball.fly.process import Child
@@ -26,12 +22,12 @@ from mjxball.reading import parse_json
 
 BEAT = 0.02  # [s] between two lines of the twin
 LATE = 0.04  # [s] of such a line, from where on it may be why something went wrong: a drone is lost after 0.1 s
-WINDOW = 3.0  # [s] for which it counts: longer than what the runner waits for
+WINDOW = 3.0  # [s] for which it counts
 LAST = 5.0  # [s] that the twin flies on once it is left, until its motors are off
 
 
-class TooSlowError(InputError):
-    """This computer cannot fly a rehearsal by this clock."""
+class RehearsalError(InputError):
+    """A rehearsal that shows nothing of the flight: this computer cannot keep up with it, or its twin has failed."""
 
 
 class Rehearsal(Child):
@@ -40,14 +36,14 @@ class Rehearsal(Child):
     def __init__(self, flags: Sequence[str]):
         """Start it with `flags` and this process's clock. Raises InputError."""
         failure = "the twin did not start; are the ports of --leader and --follower free?"
-        command = ["mjxball.fly.twin", f"--slow={clock.factor()}", "--tell", *flags]
+        command = ["mjxball.fly.twin", f"--slow={clock.factor()}", *flags]
         super().__init__(command, failure, late=clock.too_slow("the twin was not ready within 30 s"))
         assert self._process.stdout is not None
         self.uris: tuple[str, str] = tuple(parse_json(self.line)["uris"])
         self._pipe = self._process.stdout.fileno()
         self._lateness: collections.deque[tuple[float, float]] = collections.deque()  # time and lateness [s]
         self._newest = clock.now()  # when the newest line was written [s]
-        self._told: dict[str, Any] = {}  # its last line
+        self._report: dict[str, Any] = {}  # its last line
         self._ended = threading.Event()
         threading.Thread(target=self._listen, name="rehearsal", daemon=True).start()
 
@@ -66,7 +62,7 @@ class Rehearsal(Child):
         except ValueError:  # the rest of one that was read with the first
             return
         if "behind" not in told:
-            self._told = told
+            self._report = told
             return
         written, now = told["at"], clock.now()
         self._lateness.append((now, max(told["behind"], now - written, written - self._newest - BEAT)))
@@ -76,19 +72,19 @@ class Rehearsal(Child):
 
     def late(self) -> float:
         """How late the twin, or what it says, has been of late [s]."""
-        waiting = math.inf if self._ended.is_set() else clock.now() - self._newest - BEAT
-        return max([waiting, *(late for _, late in list(self._lateness))])
+        return max([clock.now() - self._newest - BEAT, *(late for _, late in list(self._lateness))])
 
-    def excuse(self, cause: Fault | None = None) -> TooSlowError | None:
-        """What is to be said instead of what went wrong, such as a fault, if that may be this computer's."""
+    def excuse(self, cause: Fault | None = None) -> RehearsalError | None:
+        """What is to be said instead of what went wrong, such as a fault, if that may be the rehearsal's own doing."""
+        if cause is not None and cause.event in (Event.KEY_KILL, Event.INTERRUPT):
+            return None
         if cause is not None and cause.event is Event.DEADLINES:
-            return TooSlowError(clock.too_slow(cause.detail))
-        if self._told.get("failure"):
-            return TooSlowError(self._told["failure"])
-        late = self.late()
-        return (
-            TooSlowError(clock.too_slow(f"the twin is up to {min(late, WINDOW):.2f} s behind")) if late > LATE else None
-        )
+            return RehearsalError(clock.too_slow(cause.detail))
+        if self._ended.is_set():
+            failure = self._report.get("failure") or "it was killed, or it crashed"
+            return RehearsalError(failure if self._report.get("slow") else f"the twin has ended: {failure}")
+        late = min(self.late(), WINDOW)
+        return RehearsalError(clock.too_slow(f"the twin is up to {late:.2f} s behind")) if late > LATE else None
 
     def end(self) -> str:
         """Leave the twin; where the object is once its motors are off, one sentence."""
@@ -96,11 +92,11 @@ class Rehearsal(Child):
         with contextlib.suppress(OSError):
             self._process.stdin.close()
         self._ended.wait(clock.real(LAST) + 5)
-        if "place" not in self._told:
-            return "the twin did not tell where the object is"
-        x, y, z = self._told["place"]
-        motors = "on" if self._told["turning"] else "off"
-        late = 1e3 * self._told["most_behind"]
+        if "place" not in self._report:
+            return "twin: the place of the object is not known"
+        x, y, z = self._report["place"]
+        motors = "on" if self._report["turning"] else "off"
+        late = 1e3 * self._report["most_behind"]
         place = f"the object is at ({x:+z.2f}, {y:+z.2f}, {z:+z.2f}) m from where it stood"
         return f"twin: {place}, motors {motors}; the twin was at most {late:.0f} ms behind"
 
@@ -108,15 +104,3 @@ class Rehearsal(Child):
         """End it, at once."""
         self._process.kill()
         super().close()
-
-
-def listen_on(pipe: int, seconds: float) -> bool:
-    """Whether `pipe` was closed within `seconds`; whatever comes over it is dropped."""
-    readable, _, _ = select.select([pipe], [], [], clock.real(seconds))
-    return bool(readable) and not os.read(pipe, 4096)
-
-
-def tell(**fields: Any) -> None:
-    """One line for the runner, which may be gone."""
-    with contextlib.suppress(OSError):
-        terminal.say(json.dumps(fields))

@@ -30,7 +30,7 @@ from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.process import Metronome, Timing, bounded, together, urgent
-from mjxball.fly.rehearsal import Rehearsal, TooSlowError
+from mjxball.fly.rehearsal import Rehearsal, RehearsalError
 from mjxball.fly.setpoints import CurveName, Variants
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
@@ -55,7 +55,7 @@ class FlightSetup:
     apps: Apps | None = None  # on board, if the laws are to run there
     rehearsal: Rehearsal | None = None  # the twin that is flown; the caller ends it
 
-    def excuse(self, cause: Fault | None = None) -> TooSlowError | None:
+    def excuse(self, cause: Fault | None = None) -> RehearsalError | None:
         """What is to be said instead of what went wrong, if it is a rehearsal and that may be this computer's."""
         return None if self.rehearsal is None else self.rehearsal.excuse(cause)
 
@@ -115,9 +115,11 @@ def fly(
             _say("interrupted before take-off")
             return 1
         except (InputError, OSError) as error:
-            told = setup.excuse() or error
-            journal.note("refused", text=str(told))
-            raise told from None
+            reason = setup.excuse() or error
+            journal.note("refused", text=str(reason))
+            if setup.rehearsal is not None and isinstance(reason, RehearsalError):
+                _say(setup.rehearsal.end())
+            raise reason from None
         finally:
             together([link.close for link in links])
             sys.setswitchinterval(before)
@@ -125,7 +127,7 @@ def fly(
 
 
 def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
-    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Raises TooSlowError alone.
+    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Raises RehearsalError alone.
 
     An error of the program in the air ends the process after `save`, see `_leave`; on the ground it stops the motors.
     """
@@ -140,7 +142,9 @@ def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
     def kill() -> None:
         flight.kill = True
 
-    with listening(land, interrupt, kill), Display(lambda: flight.view, flight.settings.limits):
+    with contextlib.ExitStack() as terminal_in_use:
+        terminal_in_use.enter_context(listening(land, interrupt, kill))
+        terminal_in_use.enter_context(Display(lambda: flight.view, flight.settings.limits))
         try:
             metronome.start()
             flight.begin(clock.now())
@@ -148,29 +152,31 @@ def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
             while going:
                 now = metronome.wait()
                 going = flight.tick(now, metronome.lateness, metronome.missed_lately(now), metronome.gap)
-        except TooSlowError:
+        except RehearsalError:
             raise
         except BaseException as error:  # nothing in here may leave thrust on, or let a pair fall that flies
             flight.note("error", text=f"{type(error).__name__}: {error}")
             if flight.flying:
-                _leave(flight, error, save)
+                _leave(flight, error, save, terminal_in_use.close)
             _emergency(flight)
     return metronome.timing()
 
 
-def _leave(flight: Flight, error: BaseException, save: Callable[[], None]) -> NoReturn:
+def _leave(flight: Flight, error: BaseException, save: Callable[[], None], restore: Callable[[], None]) -> NoReturn:
     """End as a killed runner does, without a word to the drones: zeros from here would turn the motors off.
 
-    The watchdog, or the apps on board, bring both down level.
+    The watchdog, or the apps on board, bring both down level. The log is saved and the terminal restored meanwhile.
     """
-    others = "the apps on board land both drones"
-    if flight.watchdog is not None:
-        flight.watchdog.leave()
-        others = "the watchdog brings both drones down"
-    bounded(save, SAVING)
-    with contextlib.suppress(OSError, ValueError):
+    try:
+        others = "the apps on board land both drones"
+        if flight.watchdog is not None:
+            flight.watchdog.leave()
+            others = "the watchdog brings both drones down"
+        bounded(save, SAVING)
+        restore()
         terminal.warn(f"error: the flight program failed in the air, {others}: {type(error).__name__}: {error}")
-    os._exit(1)
+    finally:
+        os._exit(1)
 
 
 def _emergency(flight: Flight) -> None:
@@ -207,8 +213,6 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
     cause = supervisor.cause
     stayed = not (flight.settings.dry_run or flight.interrupts or flight.lifted)
     code = 0 if cause is None and not stayed else 1
-    if stayed and cause is None and (slow := setup.excuse()):
-        raise slow
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
     figures = flight.flown.figures
     why, told = str(cause) if cause else "", flight.how_it_ended()
@@ -221,6 +225,8 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
         overwritten=sent,
         flown=None if figures is None else dataclasses.asdict(figures),
     )
+    if stayed and cause is None and (reason := setup.excuse()):
+        raise reason
     for text in told:
         _say(text)
     if cause is None and stayed:

@@ -52,7 +52,8 @@ class Watchdog(Child):
         """
         failure = f"the watchdog process was not ready within {start_limit:g} s"
         flags = [f"--slow={clock.factor()}", *(["--rehearses"] if rehearses else [])]
-        super().__init__(["mjxball.fly.watchdog", str(os.getpid()), *uris, *flags], failure, start_limit)
+        late = clock.too_slow(failure) if rehearses else failure
+        super().__init__(["mjxball.fly.watchdog", str(os.getpid()), *uris, *flags], failure, start_limit, late)
         assert self._process.stdin is not None
         self._pipe = self._process.stdin.fileno()
         os.set_blocking(self._pipe, False)

@@ -44,7 +44,6 @@ REFUSALS = [
     ([TRANSPORT, *URIS, "--loss", "0.1"], "--loss is for --rehearse only"),
     ([TRANSPORT, *URIS, "--slow", "2"], "--slow is for --rehearse only"),
     ([TRANSPORT, "--rehearse", "--slow", "0.5"], "--slow must be 1 to 100"),
-    ([TRANSPORT, "--rehearse", "--slow", "0.5"], "--slow must be 1 to 100"),
     ([TRANSPORT, "--rehearse", "--loss", "2"], "--loss must be 0 to 1"),
     ([TRANSPORT, "--rehearse", "--fault", "rain:leader@1"], "no KIND:DRONE@S"),
     ([TRANSPORT, "--rehearse", "--fault", "crash:both@1"], "no KIND:DRONE@S"),

@@ -54,6 +54,7 @@ def test_a_rig_whose_loops_do_not_close_cannot_fly(tmp_path: Path, capsys: pytes
             ("pair", "leader.kp = [0, 0, 0]\nleader.kd = [0, 0, 0]"),
             ("pair", "leader.kd = [0, 0, 0]"),
             ("pair", "leader.ki = [9, 9, 9]"),
+            ("stand", "leader.kp = [0, 0, 0]\nleader.kd = [0, 0, 0]\nleader.ki = [0, 0, 0]"),
             ("crazyflie", "autopilot.roll = [0, 0, 0]"),
             ("crazyflie", "autopilot.roll_rate = [0, 0, 0]"),
             ("crazyflie", "autopilot.pitch_rate = [2500, 0, 0]"),

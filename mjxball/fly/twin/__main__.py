@@ -7,23 +7,29 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
+import os
+import select
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mjxball.cli import make_parser, run_command
+from mjxball.errors import InputError
 from mjxball.fly import clock
 from mjxball.fly.app.host import compile_pair
 from mjxball.fly.card import load_policy
 from mjxball.fly.process import urgent
-from mjxball.fly.rehearsal import BEAT, LAST, listen_on, tell
+from mjxball.fly.rehearsal import BEAT, LAST
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin
+from mjxball.terminal import say
 
 
 def main() -> int:
@@ -36,7 +42,6 @@ def main() -> int:
     parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")
     add_twin_options(parser)
     parser.add_argument("--slow", type=float, default=1.0, metavar="FACTOR", help="of the runner's clock")
-    parser.add_argument("--tell", action="store_true", help="say how late it is, and at its end where the object is")
     parser.add_argument("--fault", type=read_fault, action="append", default=[], metavar="KIND:DRONE@S")
     options = parser.parse_args()
     return run_command(lambda: serve(options))
@@ -54,20 +59,18 @@ def serve(options: argparse.Namespace) -> int:
         links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
         for one in (*links, *options.fault):
             threading.Thread(target=inject_later, args=(twin, one), daemon=True).start()
-        tell(uris=twin.uris)
+        report(uris=twin.uris)
         with contextlib.suppress(KeyboardInterrupt):
-            attend(twin, options.tell)
-        if options.tell:
-            weights = Rig.of_card(card).weights if card else (0.5, 0.5)
-            place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
-            failure = str(twin.failure or "")
-            found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
-            tell(**found, failure=failure)
+            attend(twin)
+        weights = Rig.of_card(card).weights if card else (0.5, 0.5)
+        place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
+        found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
+        report(**found, failure=str(twin.failure or ""), slow=isinstance(twin.failure, InputError))
     return 0
 
 
-def attend(twin: Twin, tells: bool) -> None:
-    """Until standard input has ended and the motors are off, or the twin cannot keep up."""
+def attend(twin: Twin) -> None:
+    """Say how late the twin is, until standard input has ended and the motors are off, or the twin cannot keep up."""
     left = math.inf  # when the runner left [s]
     while twin.failure is None and clock.now() < left + LAST:
         if math.isinf(left) and listen_on(sys.stdin.fileno(), BEAT):
@@ -76,8 +79,19 @@ def attend(twin: Twin, tells: bool) -> None:
             if not twin.turning:
                 return
             clock.sleep(BEAT)
-        if tells:
-            tell(at=clock.now(), behind=twin.behind)
+        report(at=clock.now(), behind=twin.behind)
+
+
+def listen_on(pipe: int, seconds: float) -> bool:
+    """Whether `pipe` was closed within `seconds`; whatever comes over it is dropped."""
+    readable, _, _ = select.select([pipe], [], [], clock.real(seconds))
+    return bool(readable) and not os.read(pipe, 4096)
+
+
+def report(**fields: Any) -> None:
+    """One line for the runner, which may be gone."""
+    with contextlib.suppress(OSError):
+        say(json.dumps(fields))
 
 
 def inject_later(twin: Twin, one: Injection) -> None:
