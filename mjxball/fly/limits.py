@@ -63,8 +63,8 @@ class Times:
     land_speed: float = 0.25  # at which the goal sinks [m/s]
     land_spare: float = 6.0  # beyond the time the goal takes to the ground [s]
     descend_speed: float = 0.4  # [m/s]
-    descend_share: float = 1.5  # of the time that the height takes at that speed, and
-    descend_spare: float = 1.0  # [s] more, in which a descent is over: nothing may be left to see the ground by
+    descend_least: float = 4.0  # [s] in which a descent is over, or
+    descend_share: float = 2.0  # in so many times what its height takes at that speed, if that is more
     drone_watchdog: float = 2.0  # after which the firmware stops a drone that hears nothing [s]
     stop: float = 0.5  # stops are repeated for this long [s]
     stop_limit: float = 4.0  # [s]: the firmware counts as flying for 2 s after the last thrust
@@ -75,8 +75,8 @@ class Times:
     rest_sunk: float = 0.005  # by more than that [m]: a slow landing is as slow, and is not over
 
     def descent_limit(self, height: float) -> float:
-        """How long a descent from `height` [m] may last [s]."""
-        return self.descend_share * max(height, 0.0) / self.descend_speed + self.descend_spare
+        """How long a descent from `height` [m] may last [s]: longer than a slow one, which a cut would let fall."""
+        return max(self.descend_least, self.descend_share * height / self.descend_speed)
 
     @property
     def limits(self) -> dict[State, float]:
