@@ -24,7 +24,9 @@ from mjxball.terminal import sentence, warn
 from mjxball.xla import explained
 
 FAULT = 3  # exit code after an error of the program, where 1 is a result
-EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
+# Packages that another extra than `train` brings.
+EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly", "yaml": "fly", "osqp": "mpc", "websockets": "foxglove"}
+EXTRAS |= dict.fromkeys(("mcap", "mcap_ros2", "rosbags", "pyarrow"), "logs")
 SHELLS = ("bash", "zsh", "tcsh")
 Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 

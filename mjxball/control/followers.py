@@ -80,7 +80,7 @@ def checked_observation(observation: Array) -> np.ndarray:
         value, (name, unit) = seen.flat[int(size.argmax())], OBSERVATION[int(size.argmax()) % OBSERVATION_SIZE]
         raise InputError(
             f"an observation has {value:g} for {name} [{unit}], which no flight has; it was not answered, and nothing "
-            "of it is remembered: leave it out, or reset the follower"
+            "of it is remembered: call again with the next good one"
         )
     return seen
 

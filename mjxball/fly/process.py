@@ -146,7 +146,7 @@ class Child:
     def __init__(self, arguments: Sequence[str], failure: str, start_limit: float = 30.0, late: str = ""):
         """Start it. Raises InputError with the sentence `failure` if it ends, or is not ready within `start_limit` [s].
 
-        `late` is the sentence for the latter, if it is another one.
+        `late` is the sentence for the latter, if it is another one. A process that has refused its input ends this one.
         """
         self._process = subprocess.Popen(
             [sys.executable, "-m", *arguments],
@@ -160,6 +160,8 @@ class Child:
         self.line = self._process.stdout.readline().strip() if readable else ""
         if not self.line:
             self.close()
+            if self._process.returncode == 2:  # bad input, of which it has said what and why
+                sys.exit(2)
             raise InputError(failure if readable else late or failure)
 
     def __enter__(self) -> Self:

@@ -128,7 +128,9 @@ def load(path: Path, assumed: Config | None = None) -> FlightLog:
     turning = [one["t"] for one in rows if one["kind"] == "tick" and one["sent"][:, 3].max() > 0]
     if not turning:
         why = f"; {remarks[-1]}" if remarks else ""
-        raise InputError(f"flight log {path} holds no flight: no motor was ever told to turn{why}")
+        raise InputError(
+            f"flight log {path} holds no flight: no setpoint in it turns a motor (apps on board send their own){why}"
+        )
     last = max(one["t"] for one in rows if one["kind"] == "tick")
     newest = {one["drone"]: one for one in rows if one["kind"] == "state" and one["t"] < turning[0]}
     before = sorted(newest.values(), key=lambda one: float(one["t"]))

@@ -162,7 +162,8 @@ def main(arguments: Sequence[str]) -> int:
     cflib.crtp.init_drivers()
     _warm_up()
     with urgent(above=1):
-        os.write(sys.stdout.fileno(), b"ready\n")
+        with contextlib.suppress(BrokenPipeError):  # of a runner that was interrupted meanwhile
+            os.write(sys.stdout.fileno(), b"ready\n")
         left = watch(sys.stdin.fileno(), options.runner)
         if left is not None:
             take_over(options.uris, left, options.rehearses)

@@ -239,7 +239,7 @@ REFUSED: dict[str, tuple[Callable[[list[bytes]], list[bytes]], str]] = {
     "odd config": (changed(config=3), "the config of its header"),
     "odd gains": (changed(gains=["x"]), "the gains of its header"),
     "no time": (changed(t="now"), "the t of its header"),
-    "never flew": (without("tick"), "no motor was ever told to turn"),
+    "never flew": (without("tick"), "no setpoint in it turns a motor"),
     "no states": (without("state"), "no state of the leader"),
     "a clock that jumps back": (shifted(1.2, -0.3), "the time goes back by 0.29 s in its tick: cut it there"),
     "a clock that jumps back by a lot": (shifted(1.2, -3.0), "the time goes back by 2.99 s in its tick"),

@@ -44,7 +44,10 @@ class Twin:
         self.drones = TwinDrone(pair, 0, one), TwinDrone(pair, 1, other)
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in ports]
         for sock, port in zip(self._sockets, ports, strict=True):
-            sock.bind((HOST, port))
+            try:
+                sock.bind((HOST, port))
+            except OSError as error:
+                raise InputError(f"port {port} cannot be had: {error.strerror}; choose another") from None
             sock.setblocking(False)
         self._clients: list[tuple[str, int] | None] = [None, None]
         self.uris = tuple(f"udp://{HOST}:{sock.getsockname()[1]}" for sock in self._sockets)
