@@ -234,7 +234,7 @@ REFUSED: dict[str, tuple[Callable[[list[bytes]], list[bytes]], str]] = {
     "a long line": (lambda lines: [b"x" * (3 << 20)], "line of more than 1 MiB"),
     "no header": (lambda lines: lines[1:], "does not begin with a header"),
     "cut in the header": (lambda lines: [lines[0][:70]], "ends within its header"),
-    "cut before take-off": (lambda lines: [*lines[:2], lines[2][:9]], "holds no flight: no motor"),
+    "cut before take-off": (lambda lines: [*lines[:2], lines[2][:9]], "holds no flight: no setpoint"),
     "no config": (changed(config={}), "the config of its header"),
     "odd config": (changed(config=3), "the config of its header"),
     "odd gains": (changed(gains=["x"]), "the gains of its header"),
