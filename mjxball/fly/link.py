@@ -8,6 +8,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
+import itertools
 import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
 DEADLINES = Deadlines()
 ATTEMPTS, REPEAT = 8, 0.25  # of a request, and how long each answer may take [s]
+PATIENCE = 4  # attempts to start a log block until it is made anew
 QUIET = 0.1  # [s] without anything to send, after which a ping goes out
 REVISION = ("firmware.revision0", "firmware.revision1", "firmware.modified")
 
@@ -124,21 +126,30 @@ class Link:
         if self._crazyflie.log.toc.get_element_by_complete_name(APP_VARIABLES[0][0]) is not None:
             blocks.append(self._log_block("app", APP_VARIABLES, 20))
             blocks[-1].data_received_cb.add_callback(lambda stamp, values, config: self._take_app(values))
-        self._start(blocks, lambda title: getattr(self.telemetry, title) is not None)
+        self._start(blocks, lambda title: getattr(self.telemetry, title))
 
-    def _start(self, blocks: Sequence[Any], came: Callable[[str], bool]) -> None:
-        """Start log `blocks` and wait until `came` holds for the title of each. Raises LinkError if one stays silent.
+    def _start(self, blocks: Sequence[Any], newest: Callable[[str], Any]) -> None:
+        """Start log `blocks` until each has sent something, which `newest` gives by its title. Raises LinkError.
 
-        A firmware drops requests while its queue is full and cflib does not repeat them: a silent block is made anew.
+        A firmware drops requests while its queue is full, and cflib does not repeat them. A block that stays silent is
+        deleted and made anew; only a packet that comes after it is gone then counts.
         """
-        deadline = clock.now() + self._deadlines.first_state
-        while silent := [one for one in blocks if not came(one.name)]:
+        deadline, old, leaving = clock.now() + self._deadlines.first_state, dict[str, Any](), set[str]()
+        for attempt in itertools.count(1):
+            for one in [one for one in blocks if one.name in leaving and not one.added]:
+                old[one.name] = newest(one.name)
+                leaving.remove(one.name)
+            silent = [one for one in blocks if one.name in leaving or newest(one.name) is old.get(one.name)]
+            if not silent:
+                return
             if clock.now() > deadline:
                 names = ", ".join(one.name for one in silent[0].variables)
                 raise LinkError(f"the {self.name} does not send {names}; switch it off and on again")
             for one in silent:
-                self._ask(one.delete if one.added else one.start)
-            wait_until(lambda: all(came(one.name) for one in blocks), REPEAT)
+                if one.added and attempt % PATIENCE == 0:
+                    leaving.add(one.name)
+                self._ask(one.delete if one.name in leaving else one.start)
+            wait_until(lambda: not leaving and all(newest(o.name) is not old.get(o.name) for o in blocks), REPEAT)
 
     def _listed(self, variables: Iterable[Variable]) -> list[Variable]:
         """Those of `variables` that the firmware lists."""
@@ -157,13 +168,13 @@ class Link:
         listed = self._listed([(name, None) for name in names])
         if not listed:
             return {}
-        block, values = self._log_block("once", listed, 100), dict[str, float]()
-        block.data_received_cb.add_callback(lambda stamp, data, config: values.update(data))
+        block, packets_of = self._log_block("once", listed, 100), list[dict[str, float]]()
+        block.data_received_cb.add_callback(lambda stamp, data, config: packets_of.append(data))
         try:
-            self._start([block], lambda _: bool(values))
+            self._start([block], lambda _: packets_of[-1] if packets_of else None)
         finally:
             self._ask(block.delete)
-        return values
+        return packets_of[-1]
 
     def write_parameters(self, values: Mapping[str, float], check: bool = True) -> None:
         """Write each parameter and read it back (see `Parameters.write`). Raises LinkError."""

@@ -248,6 +248,21 @@ def test_delay_shows_in_the_firmwares_clock(twin: Twin, link: Link) -> None:
     assert link.telemetry.age(now) > 0.25  # and are old
 
 
+def test_a_log_block_that_answers_late_is_not_made_anew(twin: Twin, links: Callable[..., Link]) -> None:
+    """50 ms each way: it was deleted while its first packet was on its way, and the flight was refused."""
+    for delay in (0.05, 0.15):
+        twin.drones[0].link = LinkFaults()
+        link = links(twin.uris[0], dataclasses.replace(SHORT, connect=10.0, first_state=5.0, parameter=3.0))
+        link.open()
+        twin.drones[0].link = LinkFaults(delay=delay)
+        link.start_states()
+        before = link.telemetry.received
+        assert wait_for(lambda link=link, before=before: link.telemetry.received >= before + 20)  # type: ignore[misc]
+        assert link.read_logs(["pm.vbat"]).keys() == {"pm.vbat"}
+        assert link.telemetry.health is not None
+        link.close()
+
+
 def test_a_stopped_clock_makes_the_state_old(twin: Twin, link: Link) -> None:
     twin.drones[0].faults = DroneFaults(clock_stopped=True)
     assert wait_for(lambda: link.telemetry.age(time.monotonic()) > 0.3)
