@@ -33,6 +33,7 @@ CLIMB_INTEGRAL = 1.5  # likewise per m: a pair that stands gets 15 % of hover mo
 LEVEL_GAIN, LEVEL_DAMPING, LEVEL_INTEGRAL = 2.5, 0.35, 15.0
 STUCK = "the pair is not seen to leave the ground"
 LOAD = 0.03  # share of hover that a load of 20 g, 2 cm beside the middle, has the drones lift apart
+DISAGREEING = 1.5  # the same per rad by which the drones' attitudes disagree along the stick: 0.7 - 1.3 on the twin
 APART = 0.15  # share of hover that the drones lift apart at most
 
 
@@ -53,7 +54,7 @@ class TakeOff:
 
     def wanted(self, elapsed: float, seen: ObjectState, height: float, maps: Sequence[CommandMap]) -> list[Setpoint]:
         """Both setpoints `elapsed` [s] into the ramp, with O `height` [m] above where it stood."""
-        angle = math.asin(_clip(float((seen.matrix @ self._along)[2]), 1.0))
+        angle = self._angle(seen.matrix)
         tilt = (0.0, 0.0)
         if elapsed < BEGIN * self._times.ramp:
             # The floor need not be level.
@@ -68,6 +69,10 @@ class TakeOff:
         self.sent = [float(one.thrust) for one in found]
         return found
 
+    def _angle(self, matrix: np.ndarray) -> float:
+        """Of the stick above the horizon [rad]."""
+        return math.asin(_clip(float((matrix @ self._along)[2]), 1.0))
+
     def _shares(self, angle: float, seen: ObjectState, height: float) -> tuple[float, float]:
         """Shares of hover of leader and follower: a climb that is held, a stick that comes to be level."""
         missing = CLIMB - float(seen.velocity[2])
@@ -79,13 +84,14 @@ class TakeOff:
         both = min(self._share + CLIMB_GAIN * missing, MOST)
         return both - apart, both + apart
 
-    @property
-    def needed(self) -> tuple[float, float]:
+    def needed(self, quaternions: Sequence[np.ndarray]) -> tuple[float, float]:
         """Force of leader and follower that keeps the stick level, as shares of what should hover.
 
-        Up to `LOAD` it may be the load's place, as the laws know it, and on a `stand` it is the ball's.
+        Up to `LOAD` it may be the load's place, as the laws know it, and on a `stand` it is the ball's. Attitudes of
+        the drones that disagree, `quaternions` (2, 4), have each push its end to another place.
         """
-        motors = abs(self._apart) > LOAD and not self._stand
+        angles = [self._angle(rotations.matrix_from_quaternion(one)) for one in quaternions]
+        motors = abs(self._apart) > LOAD + DISAGREEING * abs(angles[0] - angles[1]) and not self._stand
         return (1.0 - self._apart, 1.0 + self._apart) if motors else (1.0, 1.0)
 
     def stuck(self, maps: Sequence[CommandMap]) -> str:

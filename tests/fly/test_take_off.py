@@ -8,12 +8,14 @@ import math
 import numpy as np
 import pytest
 
+from mjxball.control import rotations
 from mjxball.fly.card import Controller, goal_of, limits_of, load_policy
 from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.takeoff import BEGIN, MOST, TakeOff
 from mjxball.fly.telemetry import ObjectState, Rig
+from mjxball.fly.twin import avionics
 from mjxball.fly.twin.conditions import Conditions, Surroundings
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, load_file, shipped_policy
@@ -90,6 +92,19 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
         assert max(abs(moment.roll) for moment in world.track) < math.radians(2.0), gains
 
 
+def test_attitudes_that_disagree_are_not_taken_for_motors_that_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each drone pushes its end to where it sees itself level: 35 - 46 degrees where the laws went on from there."""
+    rolls = [rotations.quaternion_from_euler(np.array([math.radians(roll), 0.0, 0.0])) for roll in (1.5, -1.5)]
+    true = avionics.Onboard._attitude
+    monkeypatch.setattr(
+        avionics.Onboard, "_attitude", lambda own, drone: rotations.multiply_quaternions(true(own, drone), rolls[drone])
+    )
+    world = world_of("flight", 4.0)
+    world.run(20.0)
+    assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
+    assert max(abs(moment.roll) for moment in world.track) < math.radians(3.0)
+
+
 def test_a_policy_for_any_rig_is_told_that_it_flies_crazyflies() -> None:
     told = load_policy(shipped_policy("universal"))
     assert is_for_any(load_file(shipped_policy("universal")).card)
@@ -155,7 +170,7 @@ def test_what_holds_the_stick_level_is_what_hovers() -> None:
         one = TakeOff(RIG, Times(), PERIOD, 0.05, stand)
         for now in np.arange(0.0, Times().ramp * BEGIN + 0.2, PERIOD):
             one.wanted(float(now), seen(math.radians(-degrees)), 0.05, (CommandMap(carried_mass=0.03),) * 2)
-        leader, follower = one.needed
+        leader, follower = one.needed([np.array([1.0, 0.0, 0.0, 0.0])] * 2)
         apart = 15.0 * math.radians(degrees) * 0.2 if taken else 0.0
         assert (leader, follower) == (pytest.approx(1 + apart, abs=0.01), pytest.approx(1 - apart, abs=0.01))
     for law in ("paper", "calibrated"):

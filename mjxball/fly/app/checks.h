@@ -15,6 +15,7 @@
 #define VARIANCE 5e-4f          /* [m2] */
 #define MOST_PLACE 1000.0f      /* [m] of a state */
 #define MOST_SPEED 50.0f        /* [m/s] of a state and of a heartbeat */
+#define APART 0.15f             /* share of hover that the drones lift apart at most */
 #define MOST_RATE 50.0f         /* [rad/s]; the gyroscope ends at 35 */
 #define MOST_VOLTAGE 10.0f      /* [V] */
 

@@ -35,7 +35,6 @@
 #define LEVEL_GAIN 2.5f
 #define LEVEL_DAMPING 0.35f
 #define LEVEL_INTEGRAL 15.0f
-#define APART 0.15f
 #define LOAD 0.03f
 #define SIDE (MJXBALL_FOLLOWER ? 1.0f : -1.0f) /* sign of `apart` in this drone's lift */
 
@@ -108,14 +107,21 @@ static uint8_t refusal_of(const mjxball_app *app, uint8_t fault, const mjxball_s
     return app->peer.phase > MJXBALL_SPIN ? MJXBALL_PEER : MJXBALL_GOOD;
 }
 
+/* What the drones are to lift apart, as both found it: attitudes that disagree wind each one up by itself. */
+static float found_apart(const mjxball_app *app) {
+    float own = app->apart, other = app->peer.apart;
+    if (own * other <= 0) return 0;
+    if (own * own > other * other) own = other;
+    return own > LOAD || own < -LOAD ? own : 0;
+}
+
 static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_map *map) {
     float height = app->position[2] - app->origin[2];
     app->phase = phase;
     app->cause = cause;
     app->since = app->now;
     if (phase == MJXBALL_SPIN) app->needed = 1;
-    if (phase == MJXBALL_FLY && !mjxball_rig.stand && (app->apart > LOAD || app->apart < -LOAD))
-        app->needed = 1 + SIDE * app->apart;
+    if (phase == MJXBALL_FLY && !mjxball_rig.stand) app->needed = 1 + SIDE * found_apart(app);
     if (phase <= MJXBALL_FLY) app->trim = hover_of(app, map);
     if (phase == MJXBALL_SPIN) {
         for (int i = 0; i < 3; i++) app->origin[i] = app->position[i];

@@ -110,7 +110,7 @@ typedef struct {
     float thrust;             /* [thrust units] */
 } mjxball_setpoint;
 
-#define MJXBALL_BEAT_SIZE 44
+#define MJXBALL_BEAT_SIZE 40
 #define MJXBALL_REPLY_SIZE 8
 
 /* What a drone hears from the other one. */
@@ -119,6 +119,7 @@ typedef struct {
     uint8_t phase, trusted;
     float integral[4]; /* of the leader: its error [m s], the stick's angle error [rad s] */
     float velocity[3]; /* of O [m/s] */
+    float apart;       /* of its take-off [share of hover] */
 } mjxball_beat;
 
 typedef struct {

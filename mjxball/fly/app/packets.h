@@ -21,7 +21,7 @@ void mjxball_send(const mjxball_app *app, uint8_t out[MJXBALL_BEAT_SIZE]) {
     copy(out + 4, &mjxball_rig.key, 4);
     copy(out + 8, app->integral, 16);
     copy(out + 24, app->velocity, 12);
-    copy(out + 36, app->position, 8);
+    copy(out + 36, &app->apart, 4);
 }
 
 void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now) {
@@ -34,8 +34,9 @@ void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now)
     if (app->phase != MJXBALL_IDLE && beat.key != mjxball_rig.key) return; /* of another pair */
     copy(beat.integral, data + 8, 16);
     copy(beat.velocity, data + 24, 12);
+    copy(&beat.apart, data + 36, 4);
     if (!within(beat.integral, 3, MOST_INTEGRAL) || !within(beat.integral + 3, 1, most_turn())) return;
-    if (!within(beat.velocity, 3, MOST_SPEED)) return;
+    if (!within(beat.velocity, 3, MOST_SPEED) || !within(&beat.apart, 1, APART)) return;
     app->peer = beat;
     app->peer_time = now ? now : 1;
 }

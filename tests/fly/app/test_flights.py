@@ -11,9 +11,11 @@ from onboard_bench import cores_of, needs_gcc
 
 import fly_faults_virtual
 from fly_faults_virtual import SETTLE, cause_of, code_of, settings_of
+from mjxball.control import rotations
 from mjxball.fly.app.protocol import Phase
 from mjxball.fly.card import Controller
 from mjxball.fly.supervisor import State as Laptop
+from mjxball.fly.twin import avionics
 from mjxball.fly.twin.conditions import FAULT_KINDS, Conditions, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy
@@ -85,6 +87,23 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away():
     twin.fly_for(2.5)
     gone = np.array([moment.position for moment in twin.track])
     assert np.hypot(gone[:, 0], gone[:, 1]).max() < 0.06
+
+
+@needs_gcc
+@pytest.mark.slow
+def test_attitudes_that_disagree_are_not_taken_for_motors_that_do(monkeypatch: pytest.MonkeyPatch):
+    """Each app found another difference, 15 and -15 %: both took the pair for lighter, and it sank to the ground."""
+    rolls = [rotations.quaternion_from_euler(np.array([np.radians(roll), 0.0, 0.0])) for roll in (1.5, -1.5)]
+    true = avionics.Onboard._attitude
+    monkeypatch.setattr(
+        avionics.Onboard, "_attitude", lambda own, drone: rotations.multiply_quaternions(true(own, drone), rolls[drone])
+    )
+    twin = world(seconds=3.0)
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(2.5)
+    assert min(moment.position[2] for moment in twin.track if moment.state == "fly") - twin.rest > 0.04
+    twin.run()
+    assert code_of(twin) == 0
 
 
 @needs_gcc
