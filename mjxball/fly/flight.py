@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import math
+import operator
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -315,7 +316,7 @@ class Flight:
         self.note("transition", self._now, before=before.state.value, after=entered.value, events=names)
         if entered is State.FLY and before.state is State.RAMP:
             self.controller.reset()
-            self._commands, self._needed = None, self._take_off.needed
+            self._commands, self._needed = None, self._take_off.needed([one.quaternion for one in self._states])
         if entered is State.LAND and before.state is not State.HOLD:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
@@ -352,11 +353,13 @@ class Flight:
             return [ZERO, ZERO]
         # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
         seen, tilt = self._trusted(), (0.0, 0.0)
+        if state is State.HOLD and not any(map(operator.and_, self._monitor.estimators.trusted, self._fresh)):
+            seen = None  # it is of a moment ago
         if seen is not None and not (self.settings.stand or self._monitor.estimators.contradiction):
             tilt = setpoints.brake(seen.velocity)
         if seen is not None and state is State.DESCEND:
             share = setpoints.sinking_share(float(seen.velocity[2]), self.settings.times)
-        elif seen is not None and any(self._fresh):
+        elif seen is not None:
             share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]

@@ -18,7 +18,7 @@ from mjxball.fly import packets
 from mjxball.fly.limits import NAMES, FlightSettings, Limits
 from mjxball.fly.measured import REPEATING, DroneWatch
 from mjxball.fly.packets import DroneState, Health
-from mjxball.fly.supervisor import AIRBORNE, ON_GROUND, Event, Fault, State
+from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State
 from mjxball.fly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
 # From where on an estimator is not believed, and a drone counts as not hearing.
@@ -30,8 +30,12 @@ APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and 
 USUAL = 10.0  # [s] of that mean
 LIMITS = Limits()
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
-RECENT = 0.1  # [s] in which what is sent must have moved, where a thrust in force that stands still tells something
+RECENT = 0.1  # [s] of what was sent, against which a thrust in force that stands still is held
 SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
+CLOSED = (State.RAMP, *GUIDED)  # what is measured decides on the thrust; before, a pair at rest may be quiet
+# [s] after these in which the other stream may stand still of the same cause. Later, one that is wrong still leads down
+# better than none: the blind way would begin in its middle.
+TOGETHER = 0.1
 FROZEN = 0.1  # [s] of states that come and do not change, from which on a drone that does not hear does nothing at all
 RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
 UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
@@ -100,13 +104,15 @@ class Monitor:
         self._drones = [DroneWatch(axes, bounds.noise) for _ in NAMES]
         self.uplinks = [UplinkWatch(name) for name in NAMES]
         self.object: ObjectState | None = None  # newest that can be trusted
+        self._closed = -math.inf  # [s] when what is measured last decided on the thrust
 
     def update(self, phase: State, links: Sequence[DroneLink], ages: Sequence[float], now: float) -> list[Fault]:
         """What is wrong in the supervisor's state `phase` at `now` [s]; `ages` (2,) [s] are the states'."""
         samples = [link.telemetry.newest for link in links if link.telemetry.newest is not None]
         healths = [link.telemetry.health for link in links]
         fresh = [age <= self._settings.limits.state_age for age in ages]
-        dry, faults = self._settings.dry_run, self._measured(phase, links)
+        self._closed = now if phase in CLOSED else self._closed
+        dry, faults = self._settings.dry_run, self._measured(phase, links, now)
         if phase in AIRBORNE and all(fresh):
             faults += self.estimators.update(samples, [one and one.health for one in healths], now)
         if phase in AIRBORNE and not dry:  # a dry run is never echoed
@@ -129,7 +135,7 @@ class Monitor:
         told = [(name, watch.imu.not_shown()) for name, watch in zip(NAMES, self._drones, strict=True)]
         return next((f"{order} within a second (the {name} has not shown it)" for name, order in told if order), "")
 
-    def _measured(self, phase: State, links: Sequence[DroneLink]) -> list[Fault]:
+    def _measured(self, phase: State, links: Sequence[DroneLink], now: float) -> list[Fault]:
         """Streams that stand still, or that the IMU contradicts; watched on the ground as well, said in flight."""
         found = []
         for number, (name, link, watch) in enumerate(zip(NAMES, links, self._drones, strict=True)):
@@ -139,7 +145,7 @@ class Monitor:
             if sensed is not None:
                 repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
                 still = still or repeated
-            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in AIRBORNE else []
+            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and now - self._closed <= TOGETHER else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
             if self._settings.dry_run:  # carried by hand it shows its axes as well; at rest it may be quiet
                 own = [fault for fault in own if fault.event is Event.FRAME]
@@ -304,8 +310,9 @@ class UplinkWatch:
         moved, self._before = health.thrust != self._before, health.thrust
         times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < SAME]
         recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
-        steady = not recent or max(recent) - min(recent) < SAME
-        self.hears = bool(times) and (moved or steady)
+        # What stands still in force is most of what was sent of late, as at a bound; another one was lost.
+        usual = sum(abs(thrust - health.thrust) < SAME for thrust in recent) >= len(recent) / 2
+        self.hears = bool(times) and (moved or usual)
         if self.hears:
             self._missing, self.heard = 0, max(self.heard, times[-1])
             return []

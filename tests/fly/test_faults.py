@@ -28,13 +28,13 @@ HEIGHT = 0.4  # [m] of the hover
 G = 9.81
 
 
-def hovering(seconds: float = 20.0) -> VirtualTwin:
-    """The pair of `flight`, 3 s under both laws."""
+def hovering(seconds: float = 20.0, height: float = HEIGHT, flown: float = 3.0) -> VirtualTwin:
+    """The pair of `flight`, `flown` seconds under both laws."""
     pytest.importorskip("mujoco")
-    settings = FlightSettings(seconds, (0.0, 0.0, HEIGHT))
+    settings = FlightSettings(seconds, (0.0, 0.0, height))
     world = VirtualTwin(Policy.load(FLIGHT), settings, log=MemoryLog(False), settle=1.0)
     world.fly_until(State.FLY)
-    world.fly_for(3.0)
+    world.fly_for(flown)
     return world
 
 
@@ -95,6 +95,23 @@ def test_poses_that_freeze_one_after_the_other_leave_no_thrust_on_the_ground() -
     assert world.touchdown_speed() < 0.7
     assert cut(track).time - began < 2.5
     assert "no estimator is believed" in world.flight.how_it_ended()[-1]
+
+
+@pytest.mark.slow
+def test_an_estimate_that_fails_later_still_leads_down() -> None:
+    """The blind way down began in its middle: motors cut in the air, 3.5 m/s, or 3.1 s of thrust on the ground."""
+    for height, flown, first, later, second in (
+        (1.2, 0.8, "pose-frozen", 0.3, "pose-frozen"),
+        (0.4, 1.94, "pose-jump", 0.33, "pose-lost"),
+    ):
+        world = hovering(height=height, flown=flown)
+        world.drones[0].inject(FAULT_KINDS[first])
+        world.fly_for(later)
+        track = after(world, second, 1)
+        assert world.touchdown_speed() < 0.6, first
+        assert cut(track).position[2] - world.rest < 0.02, first
+        stood = next(moment.time for moment in track if moment.position[2] - world.rest < 0.01)
+        assert cut(track).time - stood < 1.7, first
 
 
 def test_a_descent_has_the_time_that_its_height_asks() -> None:

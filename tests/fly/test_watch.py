@@ -154,6 +154,28 @@ def test_a_drone_that_stopped_listening_is_found_within_the_firmwares_half_secon
     assert 1.2 < flown(deaf)[0] < 1.6
 
 
+def heard(sent, echo) -> tuple[bool, bool]:
+    """Whether a drone counted as hearing for 3 s, and at their end; `sent` and `echo` by the number of the tick."""
+    watch, lost = UplinkWatch("leader"), False
+    for step in range(300):
+        watch.sent(sent(step), 0.01 * step)
+        if step % 5 == 4:
+            lost = bool(watch.update(WELL._replace(thrust=float(echo(step))), 0.01 * step)) or lost
+    return not lost, watch.hears
+
+
+def test_a_thrust_that_stands_still_is_heard_where_it_is_what_was_sent() -> None:
+    """At its bound, with a dip now and then that no echo shows, a drone that hears was "not sent lately"."""
+
+    def dips(step: int) -> int:
+        return 60000 - 500 * (step % 5 == 0)
+
+    assert heard(dips, lambda step: 60000) == (True, True)
+    assert heard(dips, lambda step: 52000) == (False, False)
+    # Sent once more by chance, a moment ago; what is sent now stands still as well.
+    assert heard(lambda step: 45000 if step < 285 else 40000, lambda step: 45000) == (True, False)
+
+
 @pytest.mark.parametrize("name", ["2.1", "thrust-upgrade", "brushless"])
 @pytest.mark.parametrize("battery", [3.3, 3.7, 4.2])
 def test_both_firmwares_are_told_apart_by_their_pwm(name: str, battery: float) -> None:
