@@ -11,6 +11,7 @@ import http
 import json
 import logging
 import queue
+import socket
 import struct
 import threading
 from typing import Any
@@ -19,6 +20,7 @@ from urllib.parse import urlsplit
 from mjxball.errors import InputError
 from mjxball.fly.log_schema import Record
 from mjxball.fly.messages import Encoder
+from mjxball.fly.process import bounded
 from mjxball.reading import parse_json
 
 HOST = "127.0.0.1"
@@ -26,6 +28,7 @@ PROTOCOL: Any = "foxglove.sdk.v1"
 DATA = struct.Struct("<BIQ")  # before a message's bytes: 1, subscription, time [ns]
 BACKLOG = 1024  # messages that wait for one client; whoever is slower misses the oldest
 LARGEST = 2**16  # bytes that a client may say at once
+FAREWELL = 1.0  # [s] that a client has for closing the connection when the flight has ended
 OWN = (HOST, "localhost")
 FOXGLOVE = "https://app.foxglove.dev"
 
@@ -63,11 +66,11 @@ class Foxglove:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
         with self._lock:
             left = list(self._clients)
         for client in left:
             client.close()
+        self._server.shutdown()
 
     @property
     def address(self) -> str:
@@ -141,8 +144,10 @@ class _Client:
                     self._waiting.get_nowait()
 
     def close(self) -> None:
-        """Part from the client."""
-        self._plug.close()
+        """Part from the client; one that does not read would hold that up for ever, and is cut off."""
+        if not bounded(self._plug.close, FAREWELL):
+            with contextlib.suppress(OSError):
+                self._plug.socket.shutdown(socket.SHUT_RDWR)
 
     def send(self) -> None:
         """Send what waits, to the last."""
