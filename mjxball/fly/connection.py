@@ -83,6 +83,8 @@ def connect(
             crazyflie.console.receivedChar.add_callback(console)
             if crazyflie.link is None:  # it ended in between
                 raise LinkError(f"{name} at {uri} cannot be reached: the link ended; {REACH}")
+            # Whatever looks like the answer to a connection would begin it anew, and so reset the drone's log.
+            crazyflie.log.refresh_toc = lambda *_: None
             # Its pings share a lock with every send, and their thread holds that lock for ever when a link dies.
             bounded(crazyflie.link_statistics.stop, deadlines.close)
             return crazyflie
