@@ -92,7 +92,9 @@ def connect(
         if refused or clock.now() - started > deadlines.connect or attempt == deadlines.attempts:
             break
         progress(f"{name}: {reason}, trying again")
-    raise LinkError(f"{name} at {uri} cannot be reached: {reason}; {REACH}")
+    why = reason.removeprefix(NO_DRIVER)
+    remedy = DONGLE if why != reason and uri.startswith("radio:") else REACH
+    raise LinkError(f"{name} at {uri} cannot be reached: {why}; {remedy}")
 
 
 def _attempt(
@@ -148,6 +150,8 @@ def _start_drivers(crtp: Any) -> None:
             logger.propagate = False
 
 
+NO_DRIVER = "Couldn't load link driver: "  # of cflib: it is not the drone's fault
+DONGLE = "plug a Crazyradio in for it; on Linux it needs Bitcraze's udev rules"
 REACH = "is it on and in reach, and is the URI its own?"
 PORT, READ, WRITE = 2, 1, 2
 WINDOW = 4  # requests on their way at once: the firmware's queue is short

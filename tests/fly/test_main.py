@@ -62,24 +62,30 @@ def test_refusals(arguments: list[object], reason: str, capsys: pytest.CaptureFi
     assert_one_line(errors)
 
 
-@pytest.mark.parametrize(
-    "text",
+@rows(
+    ("text", "near"),
     [
-        "[1]",
-        "{",
-        '{"leader": {}}',
-        '{"leader": {}, "follower": 1}',
-        '{"a": 1}',
-        '{"a.b": "x"}',
-        '{"a.b": true}',
-        '{"a.b": NaN}',
+        ("[1]", ""),
+        ("{", ""),
+        ('{"leader": {}}', ""),
+        ('{"leader": {}, "follower": 1}', ""),
+        ('{"leder": {}, "follower": {}}', "leader"),
+        ('{"roll_kp": 6}', "pid_attitude.roll_kp"),
+        ('{"pid_attitud.roll_kp": 6}', "pid_attitude.roll_kp"),
+        ('{"a": 1}', ""),
+        ('{"a.b": "x"}', ""),
+        ('{"a.b": true}', ""),
+        ('{"a.b": NaN}', ""),
     ],
 )
-def test_gain_files_that_are_none(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gain_files_that_are_none(text: str, near: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gains.json"
     path.write_text(text)
     assert call(main, [TRANSPORT, *URIS, "--gains", path]) == 2
-    assert "gain file" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert str(path) in errors
+    assert ("did you mean" in errors) == bool(near)
+    assert near in errors
 
 
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
