@@ -121,7 +121,7 @@ def _attempt(
     crazyflie.connection_lost.add_callback(refused)
     crazyflie.packet_received.add_callback(arrived)
     threading.Thread(target=crazyflie.open_link, args=(uri,), daemon=True).start()
-    while not ready.wait(0.5):
+    while not ready.wait(clock.real(0.5)):
         now = clock.now()
         if now - heard[0] > deadlines.silence or now - started > deadlines.connect:
             return crazyflie, f"no answer within {now - heard[0]:.1f} s", False

@@ -25,7 +25,7 @@ from mjxball.fly.display import Display, listening
 from mjxball.fly.figures import LEAST, SETTLING
 from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.limits import NAMES, Check, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Preflight, check, prepare
@@ -155,7 +155,8 @@ def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
         except RehearsalError:
             raise
         except BaseException as error:  # nothing in here may leave thrust on, or let a pair fall that flies
-            flight.note("error", text=f"{type(error).__name__}: {error}")
+            with contextlib.suppress(Exception):
+                flight.note("error", text=f"{type(error).__name__}: {error}")
             if flight.flying:
                 _leave(flight, error, save, terminal_in_use.close)
             _emergency(flight)
@@ -200,6 +201,7 @@ def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings
         checks += setup.mocap.checks()
         setup.mocap.guarding = True
     checks += [] if setup.apps is None else map(check_ready, links)
+    checks += [Check("log", False, f"{journal.failure}: choose another --log")] if journal.failure else []
     if not all(one.passed for one in checks) and (slow := setup.excuse()):
         raise slow
     for one in checks:

@@ -88,6 +88,17 @@ def test_gain_files_that_are_none(text: str, near: str, tmp_path: Path, capsys: 
     assert near in errors
 
 
+def test_an_install_that_cannot_write_mcap_is_refused(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """Found out by the process that writes it, it was a flight without a log."""
+    for missing in ("mcap_ros2", "mcap.writer"):
+        with monkeypatch.context() as changed:
+            for name in [one for one in sys.modules if one.startswith("mcap")]:
+                changed.delitem(sys.modules, name)
+            changed.setitem(sys.modules, missing, None)
+            assert call(main, [TRANSPORT, *URIS, "--log", "flight.mcap"]) == 2
+            assert "pip install 'mjxball[logs]'" in capsys.readouterr().err
+
+
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
     modules = [
         "main",
