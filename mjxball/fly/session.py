@@ -234,8 +234,8 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
     if cause is None and stayed:
         _say("it did not lift: is it heavier than its plant, or does a propeller give less?")
     if flight.settings.dry_run and flight.highest:
-        text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
-        _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
+        text = ", ".join(f"{units} ({name})" for name, units in zip(NAMES, flight.highest, strict=True))
+        _say(f"dry run: zeros were sent; to a pair that does not lift it would have sent up to {text} thrust units")
     if flight.settings.dry_run and setup.mocap is not None:
         _say(
             f"axes: not shown yet: {flight.carry}" if flight.carry else "axes: every turn and way agrees with the IMUs"
@@ -243,7 +243,7 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
     if supervisor.cause is None and not (figures or flight.settings.dry_run):
-        _say(f"no error of the flight: it takes {SETTLING:g} s to settle and {LEAST:g} s to measure (--seconds)")
+        _say(f"hover error not measured: --seconds must allow {SETTLING:g} s to settle and {LEAST:g} s more")
     if figures is not None:
         _say(str(figures))
     if journal.failure:
