@@ -6,11 +6,11 @@ shows, wherever it is from, so that the origin decides who is answered; Foxglove
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import http
 import json
 import logging
-import queue
 import socket
 import struct
 import threading
@@ -132,16 +132,17 @@ class _Client:
     def __init__(self, plug: Any):
         self.wanted: dict[int, int] = {}  # channel by the number of its subscription
         self._plug = plug
-        self._waiting: queue.Queue[str | bytes | None] = queue.Queue(BACKLOG)
+        self._waiting: collections.deque[str | bytes | None] = collections.deque()
+        self._news = threading.Condition()
 
     def tell(self, message: str | bytes | None) -> None:
-        """Send `message`, later; None is the last."""
-        while True:
-            try:
-                return self._waiting.put_nowait(message)
-            except queue.Full:
-                with contextlib.suppress(queue.Empty):
-                    self._waiting.get_nowait()
+        """Send `message`, later; None is the last. Of too many the oldest data are left out, and no text is."""
+        with self._news:
+            data = (place for place, one in enumerate(self._waiting) if isinstance(one, bytes))
+            if len(self._waiting) >= BACKLOG and (oldest := next(data, None)) is not None:
+                del self._waiting[oldest]
+            self._waiting.append(message)
+            self._news.notify()
 
     def close(self) -> None:
         """Part from the client; one that does not read would hold that up for ever, and is cut off."""
@@ -154,8 +155,13 @@ class _Client:
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):
-            while (message := self._waiting.get()) is not None:
+            while (message := self._next()) is not None:
                 self._plug.send(message)
+
+    def _next(self) -> str | bytes | None:
+        with self._news:
+            self._news.wait_for(lambda: self._waiting)
+            return self._waiting.popleft()
 
 
 def _check(plug: Any, request: Any) -> Any:
