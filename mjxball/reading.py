@@ -6,12 +6,13 @@ Standard library only.
 from __future__ import annotations
 
 import bisect
+import difflib
 import itertools
 import json
 import math
 import statistics
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeGuard
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
@@ -54,6 +55,11 @@ def shown(value: Any) -> str:
     """`value` of a file or a command line as a sentence shows it."""
     text = repr(value)
     return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}..."
+
+
+def near(name: str, known: Iterable[str], cutoff: float = 0.8) -> str:
+    """The one of the `known` names that is spelt like `name`, as a question; empty if there is none."""
+    return "".join(f" (did you mean {one}?)" for one in difflib.get_close_matches(name, list(known), 1, cutoff))
 
 
 def _whole(digits: str) -> float:

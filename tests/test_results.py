@@ -228,7 +228,7 @@ def rounding(pivot: bool) -> float:
 
 
 def silent_uplink() -> Numbers:
-    own = [row for row in measured("fly_faults_virtual")["faults"] if row["fault"] == "uplink silent"]
+    own = [row for row in measured("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"]
     return [max(row[name] for row in own) for name in ("height", "speed")]
 
 

@@ -19,7 +19,7 @@ from mjxball.fly.mocap_supervision import MocapLimits
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
 from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import TRANSITIONS, Event, State
-from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.conditions import FAULT_KINDS, Conditions
 from mjxball.fly.twin.drone import ACTED
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
@@ -126,14 +126,20 @@ TURNED = 90  # [degrees] of tilt, from which on the pair lies on its back
 
 
 def faults() -> str:
-    """What `benchmarks/fly_faults_virtual.py` found: of each fault the flight with the harder touchdown."""
+    """What `--fault` does, and what `benchmarks/fly_faults_virtual.py` found: the flight with the harder touchdown."""
     rows = json.loads(FAULTS.read_text(encoding="utf-8"))["faults"]
-    lines = ["| fault | then | motors off [s] | touchdown | tilt | drift |", "|---|---|---|---|---|---|"]
-    for name in dict.fromkeys(row["fault"] for row in rows):
-        worst = max((row for row in rows if row["fault"] == name), key=lambda row: row["speed"])
+    head = ("`--fault`", "what happens", "then", "motors off [s]", "touchdown", "tilt", "drift")
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for name in dict.fromkeys([*FAULT_KINDS, *(row["fault"] for row in rows)]):
+        about = f"`{name}` | {FAULT_KINDS[name].about}" if name in FAULT_KINDS else f"| {name}"
+        own = [row for row in rows if row["fault"] == name]
+        if not own:
+            lines.append(f"| {about} |" + " |" * (len(head) - 2))
+            continue
+        worst = max(own, key=lambda row: row["speed"])
         off = ", ".join(f"{value:.2f}" for value in worst["off"])
         numbers = f"{worst['speed']:.2f} m/s | {worst['tilt']:.0f}° | {worst['drift']:.2f} m"
-        lines.append(f"| {name} ({worst['drone']}) | {reaction(worst)} | {off} | {numbers} |")
+        lines.append(f"| {about} ({worst['drone']}) | {reaction(worst)} | {off} | {numbers} |")
     return "\n".join(lines)
 
 

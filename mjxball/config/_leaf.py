@@ -9,7 +9,7 @@ Vector3 = tuple[float, float, float]
 Range = tuple[float, float]
 
 
-MOST = 32  # numbers in a tuple of any length
+MOST = 256  # numbers in a tuple of any length
 
 
 def setting(

@@ -35,14 +35,14 @@ class Sac:
     learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", low=1e-12, high=1)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     n_step: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
-    tau: float = setting(0.02, "rate of the slow copies that give the targets", low=1e-6, high=1)
-    alpha: float = setting(0.02, "temperature at the start", low=1e-8, high=1000)
+    tau: float = setting(0.02, "rate of the slow copies that give the targets", low=1e-9, high=1)
+    alpha: float = setting(0.02, "temperature at the start", low=1e-12, high=1e6)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")
-    target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]", low=-100, high=100)
-    reward_scale: float = setting(1.0, "factor on the reward inside the critic", low=1e-6, high=1e6)
+    target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]", low=-1e4, high=1e4)
+    reward_scale: float = setting(1.0, "factor on the reward inside the critic", low=1e-9, high=1e9)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     learning_rate_final_ratio: float = setting(
-        0.1, "rate at the end of the run over the rate at its start", low=1e-6, high=1
+        0.1, "rate at the end of the run over the rate at its start", low=1e-12, high=1
     )
 
 
@@ -57,7 +57,7 @@ class Ppo:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1, high=100_000)
     learning_rate: float = setting(2e-3, "Adam's rate at the start", low=1e-12, high=1)
     discount: float = setting(0.97, "gamma", low=0, high=0.99999)
-    entropy_cost: float = setting(0.0, "weight of the policy's entropy", low=0, high=100)
+    entropy_cost: float = setting(0.0, "weight of the policy's entropy", low=0, high=1e6)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
 
 
@@ -79,20 +79,20 @@ class Gradient:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1, high=100_000)
     learning_rate: float = setting(2e-2, "Adam's rate at the start", low=1e-12, high=1)
     learning_rate_final_ratio: float = setting(
-        0.02, "rate at the end of the run over the rate at its start", low=1e-6, high=1
+        0.02, "rate at the end of the run over the rate at its start", low=1e-12, high=1
     )
     adam_betas: tuple[float, float] = setting(
         (0.9, 0.999), "what Adam keeps in a step of its means of gradients and of their squares", low=0, high=0.99999
     )
     gradient_decay: float = setting(
-        1.0, "factor on the gradient that passes from a control step to the one before", low=0.001, high=1
+        1.0, "factor on the gradient that passes from a control step to the one before", low=1e-6, high=1
     )
     state_gradient_clip: float = setting(
         0.0,
         "largest length of the gradient that passes through one environment's state from a control step to the one "
         "before, in units of 1 / (horizon num_envs); 0: no limit",
         low=0,
-        high=1e8,
+        high=1e12,
     )
     impulse_response: float = setting(
         0.0,
@@ -100,6 +100,6 @@ class Gradient:
         "is to die out also where errors are too small to cost anything; it counts in the last quarter of the "
         "gradient steps, which take three times as long",
         low=0,
-        high=1000,
+        high=1e6,
     )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)

@@ -160,30 +160,59 @@ def check_all_was_named(
 
     if not thrusters:  # nothing pushes where the file beside the model tells the rotors
         bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    draw, data = np.random.default_rng(0), mujoco.MjData(bare)
+    plain = _plain_model(parts, load, slides, bare.opt.gravity)
+    if plain is None:
+        return
+    draw, data, own = np.random.default_rng(0), mujoco.MjData(bare), mujoco.MjData(plain)
     place, start = bare.jnt_qposadr[_free(bare)], bare.jnt_dofadr[_free(bare)]
     moving = [*range(start, start + 6), *(bare.jnt_dofadr[slide.joint] for slide in slides)]
     weight = sum(part.mass for part in (*parts, *([load] if load else []))) * -bare.opt.gravity[2]
     for _ in range(STATES):
         turned = draw.normal(size=4)
-        data.qpos[place + 3 : place + 7] = turned / np.linalg.norm(turned)
-        data.qvel[moving] = draw.normal(size=len(moving))
+        own.qpos[3:7] = data.qpos[place + 3 : place + 7] = turned / np.linalg.norm(turned)
+        own.qvel[:] = data.qvel[moving] = draw.normal(size=len(moving))
         forces = _push(bare, data, thrusters, 2 * weight, draw)
         mujoco.mj_forward(bare, data)
-        axes = np.zeros(9)
-        mujoco.mju_quat2Mat(axes, data.qpos[place + 3 : place + 7])
-        turn = axes.reshape(3, 3).T
-        theirs = data.qacc[moving]
-        theirs[:3] = turn @ theirs[:3]
-        ours = _accelerations(
-            parts, load, [slide.axis for slide in slides], turn @ bare.opt.gravity, data.qvel[moving][3:], forces
-        )
+        mujoco.mj_fwdPosition(plain, own)
+        axes, own.qfrc_applied[:] = own.xmat[1].reshape(3, 3), 0
+        for rotor, force in forces:
+            lift, twist = force * axes[:, 2], force * (rotor.yaw or 0.0) * axes[:, 2]
+            mujoco.mj_applyFT(plain, own, lift, twist, own.qpos[:3] + axes @ rotor.place, 1, own.qfrc_applied)
+        mujoco.mj_forward(plain, own)
+        theirs, ours = data.qacc[moving], own.qacc
         off = np.abs(theirs - ours).max()
-        if np.isfinite(ours).all() and not off <= CLOSE * np.abs([theirs, ours]).max():
+        if not off <= CLOSE * np.abs([theirs, ours]).max():
             raise InputError(
                 f"MuJoCo's accelerations of it are up to {off:.2g} m/s2 or rad/s2 off those of its masses and "
                 "rotors: something else acts on it, or its numbers are those of no rig"
             )
+
+
+def _plain_model(parts: Sequence[Rigid], load: Rigid | None, slides: Sequence[Slide], gravity: Vector) -> Any:
+    """A free body of `parts` with the `load` on `slides`, and nothing else; None for numbers that no rig has.
+
+    The settings' checks name those.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.option.gravity = gravity
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    for part in (*parts, *([load] if load else [])):
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = part.inertia
+        solid = body.add_body(mass=part.mass, ipos=part.centre, fullinertia=[xx, yy, zz, xy, xz, yz])
+        solid.explicitinertial = True
+        for slide in slides if part is load else ():
+            solid.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=slide.axis)
+    try:
+        model = spec.compile()
+    except ValueError:
+        return None
+    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, matrix)
+    return model if np.linalg.cond(matrix) < WORST else None
 
 
 def _push(
@@ -199,42 +228,3 @@ def _push(
             data.act[bare.actuator_actadr[number]] = put
         forces.append((rotor, per_input * put))
     return forces
-
-
-def _accelerations(
-    parts: Sequence[Rigid],
-    load: Rigid | None,
-    slides: Sequence[np.ndarray],
-    gravity: np.ndarray,
-    rates: np.ndarray,
-    forces: Sequence[tuple[Rotor, float]],
-) -> np.ndarray:
-    """(6 + slides,) accelerations of the free body's origin, of its rates and of the load, in its axes (ours).
-
-    `rates`: those of the body, then of the load. From sum_parts J^T (m a, I w' + w x I w) = J^T (forces), J the
-    Jacobian of a part's centre and attitude. NaN for numbers that no rig has, which the settings' checks name.
-    """
-    spin, across = rates[:3], np.array(slides).reshape(-1, 3)
-    size = 6 + len(across)
-    matrix, side = np.zeros((size, size)), np.zeros(size)
-
-    def jacobians(place: np.ndarray, slid: bool) -> tuple[np.ndarray, np.ndarray]:
-        linear, angular = np.zeros((3, size)), np.zeros((3, size))
-        linear[:, :3] = angular[:, 3:6] = np.eye(3)
-        linear[:, 3:6] = np.cross(np.eye(3), place).T
-        if slid:
-            linear[:, 6:] = across.T
-        return linear, angular
-
-    for part in (*parts, *([load] if load else [])):
-        linear, angular = jacobians(part.centre, part is load)
-        carried = np.cross(spin, np.cross(spin, part.centre))
-        if part is load:
-            carried = carried + 2 * np.cross(spin, across.T @ rates[3:])
-        matrix += part.mass * linear.T @ linear + angular.T @ part.inertia @ angular
-        side += part.mass * linear.T @ (gravity - carried) - angular.T @ np.cross(spin, part.inertia @ spin)
-    for rotor, force in forces:
-        linear, angular = jacobians(rotor.place, False)
-        side += force * (linear[2] + (rotor.yaw or 0.0) * angular[2])
-    sound = np.isfinite(matrix).all() and np.linalg.cond(matrix) < WORST
-    return np.linalg.solve(matrix, side) if sound else np.full(size, np.nan)

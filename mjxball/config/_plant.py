@@ -43,12 +43,12 @@ class Plant:
         0.2, "nominal mass of the object, all of it moving with the CG [kg]", low=1e-12, high=1e5
     )
     object_size: Vector3 = setting(
-        (0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", low=0.0001, high=1e5
+        (0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", low=1e-6, high=1e5
     )
     moving_fraction: float = setting(
-        1.0, "share of the object's mass that moves; the rest is a fixed box about O", low=0.0001, high=1
+        1.0, "share of the object's mass that moves; the rest is a fixed box about O", low=1e-6, high=1
     )
-    ball_radius: float = setting(0.02, "radius of the moving ball [m]", low=0.0001, high=1e4)
+    ball_radius: float = setting(0.02, "radius of the moving ball [m]", low=1e-6, high=1e4)
     ball_stop: float = setting(
         0.0, "ball's centre from O at an end stop or at the rim, 0: it touches the object's end [m]", low=0, high=1e4
     )
@@ -58,14 +58,14 @@ class Plant:
     stand: Literal["free", "pivot", "heave"] = setting(
         "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
     )
-    arm: float = setting(0.12, "centre of a drone to each rotor [m]", low=0.001, high=1e5)
+    arm: float = setting(0.12, "centre of a drone to each rotor [m]", low=1e-6, high=1e5)
     layout: Literal["plus", "x"] = setting(
         "plus", "rotors on the body axes, 1 at +x, 2 at +y; or between them as on a Crazyflie, 1 at +x -y, 2 at -x -y"
     )
-    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", low=0.0001, high=1e6)
-    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", low=0.0001, high=1e4)
-    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", low=1e-5, high=1e5)
-    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", low=0.01, high=1e4)
+    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", low=1e-6, high=1e6)
+    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", low=1e-9, high=1e4)
+    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", low=1e-9, high=1e5)
+    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", low=1e-6, high=1e4)
 
     def __repr__(self) -> str:
         """Short: `to_json` has all of it."""

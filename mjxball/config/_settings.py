@@ -40,9 +40,9 @@ class Attitude:
     """The PD attitude loop that each drone runs once per physics step (ours)."""
 
     natural_frequency: Vector3 = setting(
-        (10.0, 10.0, 4.0), "natural frequency of roll, pitch, yaw [rad/s]", low=0.01, high=1e4
+        (10.0, 10.0, 4.0), "natural frequency of roll, pitch, yaw [rad/s]", low=0.001, high=1e4
     )
-    damping: float = setting(0.9, "damping ratio", low=0.01, high=10)
+    damping: float = setting(0.9, "damping ratio", low=0.001, high=1000)
     design_object_mass: float = setting(0.2, "object mass that the gains are for [kg]", low=0, high=1e5)
 
 
@@ -53,14 +53,14 @@ class Autopilot:
     """
 
     kind: Literal["ideal", "crazyflie"] = setting("ideal", "ideal: PD of `attitude`; crazyflie: the firmware's cascade")
-    roll: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.roll_kp, ki, kd [1/s, 1/s2, 1]", low=0, high=1000)
-    pitch: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.pitch_kp, ki, kd", low=0, high=1000)
-    yaw: Vector3 = setting((6.0, 1.0, 0.35), "pid_attitude.yaw_kp, ki, kd", low=0, high=1000)
+    roll: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.roll_kp, ki, kd [1/s, 1/s2, 1]", low=0, high=1e6)
+    pitch: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.pitch_kp, ki, kd", low=0, high=1e6)
+    yaw: Vector3 = setting((6.0, 1.0, 0.35), "pid_attitude.yaw_kp, ki, kd", low=0, high=1e6)
     roll_rate: Vector3 = setting(
-        (250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0, high=1e5
+        (250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0, high=1e6
     )
-    pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0, high=1e5)
-    yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0, high=1e5)
+    pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0, high=1e6)
+    yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0, high=1e6)
     follower_ki_scale: float = setting(
         1.0, "factor on the follower's ki: two drones that integrate on one body work against each other", low=0, high=1
     )
@@ -84,11 +84,11 @@ class Autopilot:
 class Leader:
     """The leader's PID law (paper eq. 5) and its command limits."""
 
-    kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0, high=1000)
-    kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0, high=1000)
-    ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0, high=1000)
+    kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0, high=1e6)
+    kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0, high=1e6)
+    ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0, high=1e6)
     integral_error_limit: Vector3 = setting(
-        (1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", low=0.001, high=1e6
+        (1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", low=1e-6, high=1e12
     )
     integral_lead_time: float = setting(
         0.0,
@@ -112,8 +112,8 @@ class Leader:
 class Command:
     """Limits of what any drone is sent, leader or follower."""
 
-    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", low=0.001, high=1.2)
-    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", low=0.001, high=1000)
+    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", low=1e-6, high=1.2)
+    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", low=1e-6, high=1e6)
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ class Follower:
     action: Literal["residual", "direct"] = setting(
         "residual", "residual: added to the PD law on its own observation; direct: the command itself"
     )
-    action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", low=0.0001, high=1.2)
-    action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", low=0.0001, high=1000)
+    action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", low=1e-9, high=1.2)
+    action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", low=1e-9, high=1e6)
     residual_on_pid: bool = setting(
         False,
         "a residual action is added to the leader's PID law, integrals included, not to its PD part alone, behind a "
@@ -143,7 +143,7 @@ class Follower:
         (),
         "time constants of exponential averages of observations and actions that the network sees [s]",
         low=0.001,
-        high=1000,
+        high=1e6,
     )
     recurrent_units: int = setting(
         0, "units of a GRU whose state the network carries from step to step; 0: none", low=0, high=512
@@ -201,10 +201,10 @@ class ScenarioRanges:
         0.0, "probability of a firmware that does not compensate for the battery", low=0, high=1
     )
     gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, high=1e4)
-    rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", low=0.01, high=100)
-    thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", low=0.01, high=100)
-    thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", low=0.01, high=100)
-    inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", low=0.01, high=100)
+    rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", low=0.001, high=1000)
+    thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", low=0.001, high=1000)
+    thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", low=0.001, high=1000)
+    inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", low=0.001, high=1000)
     cg_width: Range = drawn(
         (0.0, 0.0),
         "in the plane: amplitude of the CG's second sine, across the first one, over that one's; in three flights of "
@@ -223,17 +223,17 @@ class ScenarioRanges:
         high=16,
     )
     drone_mass_scale: Range = drawn(
-        (1.0, 1.0), "factor on the drones' masses, which their hover thrust knows", low=0.01, high=100
+        (1.0, 1.0), "factor on the drones' masses, which their hover thrust knows", low=0.001, high=1000
     )
-    drone_inertia_scale: Range = drawn((1.0, 1.0), "factor on all drones' own inertia", low=0.01, high=100)
-    mount_scale: Range = drawn((1.0, 1.0), "factor on all mounts' distances from O", low=0.01, high=100)
-    arm_scale: Range = drawn((1.0, 1.0), "factor on all rotors' arms", low=0.01, high=100)
-    yaw_per_thrust_scale: Range = drawn((1.0, 1.0), "factor on all rotors' yaw moment over force", low=0.01, high=100)
-    rotor_force_scale: Range = drawn((1.0, 1.0), "factor on all rotors' largest force", low=0.01, high=100)
+    drone_inertia_scale: Range = drawn((1.0, 1.0), "factor on all drones' own inertia", low=0.001, high=1000)
+    mount_scale: Range = drawn((1.0, 1.0), "factor on all mounts' distances from O", low=0.001, high=1000)
+    arm_scale: Range = drawn((1.0, 1.0), "factor on all rotors' arms", low=0.001, high=1000)
+    yaw_per_thrust_scale: Range = drawn((1.0, 1.0), "factor on all rotors' yaw moment over force", low=0.001, high=1000)
+    rotor_force_scale: Range = drawn((1.0, 1.0), "factor on all rotors' largest force", low=0.001, high=1000)
     carrier_scale: Range = drawn(
-        (1.0, 1.0), "factor on the carrier's mass and inertia, which is known", low=0.01, high=100
+        (1.0, 1.0), "factor on the carrier's mass and inertia, which is known", low=0.001, high=1000
     )
-    attitude_gain_scale: Range = drawn((1.0, 1.0), "factor on all attitude gains", low=0.01, high=100)
+    attitude_gain_scale: Range = drawn((1.0, 1.0), "factor on all attitude gains", low=0.001, high=1000)
     lost_follower_probability: float = setting(
         0.0, "probability that one follower's rotors stop, 3 to 15 s after the start", low=0, high=1
     )
@@ -246,7 +246,7 @@ class ScenarioRanges:
     )
     unknown_mass: Range = drawn((0.1, 0.35), "true mass of the object in these flights [kg]", low=1e-12, high=1e5)
     termination_distance: float = setting(
-        2.5, "an episode ends when |e_o| exceeds this, d_term [m]", low=0.01, high=1e6
+        2.5, "an episode ends when |e_o| exceeds this, d_term [m]", low=1e-6, high=1e12
     )
 
 
@@ -255,53 +255,53 @@ class Reward:
     """Reward of one control step. `paper` mimics the leader; `task` (ours) scores what the user wants."""
 
     kind: Literal["paper", "task"] = setting("task", "paper (leader mimicry) or task (balance)")
-    error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0, high=1e6)
+    error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0, high=1e9)
     error_scale: float = setting(
-        0.1, "|e_o| at which the error's cost turns from square to linear [m]", low=1e-6, high=1000
+        0.1, "|e_o| at which the error's cost turns from square to linear [m]", low=1e-9, high=1e6
     )
-    velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0, high=1e6)
-    tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0, high=1e6)
-    rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0, high=1e6)
-    effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0, high=1e6)
-    smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0, high=1e6)
+    velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0, high=1e9)
+    tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0, high=1e9)
+    rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0, high=1e9)
+    effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0, high=1e9)
+    smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0, high=1e9)
     command_change: float = setting(
         0.0,
         "weight of the squared change of the follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command",
         low=0,
-        high=1e6,
+        high=1e9,
     )
-    ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0, high=1e6)
+    ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0, high=1e9)
     steady_action: float = setting(
         0.0,
         "weight of the squared slowest average of the network action: what stands is the integrals' part",
         low=0,
-        high=1e6,
+        high=1e9,
     )
     tilt_disagreement: float = setting(
         0.0,
         "weight of the squared difference of both drones' tilt commands about the axis that no load turns",
         low=0,
-        high=1e6,
+        high=1e9,
     )
     spread: float = setting(
         0.0,
         "weight of the squared differences of a follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command to "
         "the mean of all followers: they are not to work against each other",
         low=0,
-        high=1e6,
+        high=1e9,
     )
-    termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0, high=1e6)
+    termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0, high=1e9)
 
 
 @dataclass(frozen=True)
 class Bounds:
     """What `eval.py --check` enforces for the exported policy on the reference scenario; 0 leaves a metric free."""
 
-    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0, high=1000)
-    settling_time: float = setting(4.0, "2 % settling time [s]", low=0, high=1e5)
-    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", low=0, high=1000)
+    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0, high=1e12)
+    settling_time: float = setting(4.0, "2 % settling time [s]", low=0, high=1e12)
+    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", low=0, high=1e12)
     action_error: float = setting(
-        0.0, "rms of the command less the leader's, over all three [rad, m/s2]", low=0, high=1000
+        0.0, "rms of the command less the leader's, over all three [rad, m/s2]", low=0, high=1e12
     )
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 import re
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mjxball.config._plant import Drone
 from mjxball.config._renamed import CONSTANT, check_constant, current_name, with_current_names
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
-from mjxball.reading import shown
+from mjxball.reading import near, shown
 
 MAX_LISTED = 6
 
@@ -100,7 +99,7 @@ def apply_overrides(config: Config, values: Mapping[str, Any]) -> Config:
             known = {path: value for path, value, _ in leaves(config)}
             continue
         if path not in known:
-            raise InputError(f"{path} is not a setting{_near(path, known)}; `train.py --help all` lists them")
+            raise InputError(f"{path} is not a setting{near(path, known)}; `train.py --help all` lists them")
         if isinstance(value, list):
             whole = all(type(one) is int for one in value) and _holds_floats(known[path])
             value = tuple(map(float, value) if whole else value)  # noqa: PLW2901
@@ -125,11 +124,6 @@ def _parse(path: str, text: str, example: Any, kind: type) -> Any:
         raise InputError(f"--{path} takes {wanted[type(example)]}, not {shown(text)}") from None
 
 
-def _near(name: str, known: Iterable[str]) -> str:
-    """The one of the `known` names that is spelt like `name`, as a question; empty if there is none."""
-    return "".join(f" (did you mean {one}?)" for one in difflib.get_close_matches(name, list(known), 1, 0.8))
-
-
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain dictionary of a configuration (tuples become lists in JSON)."""
     return dataclasses.asdict(config)
@@ -150,7 +144,7 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
     missing = sorted(set(names) - set(data))
     if unknown or missing:
         where = f" in {path}" if path else ""
-        spelt = [f"unknown {str(name)[:60]}{_near(str(name)[:60], names)}" for name in unknown[:MAX_LISTED]]
+        spelt = [f"unknown {str(name)[:60]}{near(str(name)[:60], names)}" for name in unknown[:MAX_LISTED]]
         what = ", ".join(spelt + [f"missing {name}" for name in missing][:MAX_LISTED])
         raise InputError(f"configuration does not fit this version{where}: {what}")
     values = {}

@@ -83,6 +83,8 @@ def connect(
             crazyflie.console.receivedChar.add_callback(console)
             if crazyflie.link is None:  # it ended in between
                 raise LinkError(f"{name} at {uri} cannot be reached: the link ended; {REACH}")
+            # Whatever looks like the answer to a connection would begin it anew, and so reset the drone's log.
+            crazyflie.log.refresh_toc = lambda *_: None
             # Its pings share a lock with every send, and their thread holds that lock for ever when a link dies.
             bounded(crazyflie.link_statistics.stop, deadlines.close)
             return crazyflie
@@ -90,7 +92,9 @@ def connect(
         if refused or clock.now() - started > deadlines.connect or attempt == deadlines.attempts:
             break
         progress(f"{name}: {reason}, trying again")
-    raise LinkError(f"{name} at {uri} cannot be reached: {reason}; {REACH}")
+    why = reason.removeprefix(NO_DRIVER)
+    remedy = DONGLE if why != reason and uri.startswith("radio:") else REACH
+    raise LinkError(f"{name} at {uri} cannot be reached: {why}; {remedy}")
 
 
 def _attempt(
@@ -117,7 +121,7 @@ def _attempt(
     crazyflie.connection_lost.add_callback(refused)
     crazyflie.packet_received.add_callback(arrived)
     threading.Thread(target=crazyflie.open_link, args=(uri,), daemon=True).start()
-    while not ready.wait(0.5):
+    while not ready.wait(clock.real(0.5)):
         now = clock.now()
         if now - heard[0] > deadlines.silence or now - started > deadlines.connect:
             return crazyflie, f"no answer within {now - heard[0]:.1f} s", False
@@ -146,6 +150,8 @@ def _start_drivers(crtp: Any) -> None:
             logger.propagate = False
 
 
+NO_DRIVER = "Couldn't load link driver: "  # of cflib: it is not the drone's fault
+DONGLE = "plug a Crazyradio in for it; on Linux it needs Bitcraze's udev rules"
 REACH = "is it on and in reach, and is the URI its own?"
 PORT, READ, WRITE = 2, 1, 2
 WINDOW = 4  # requests on their way at once: the firmware's queue is short

@@ -64,8 +64,8 @@ class LiftWatch:
             began, before = seen[0]
             falls = (before - level) / WINDOW if now - began >= WINDOW else 0.0
             if margin < max(falls, 0.0) * needed:
-                text = f"{name} at {level:.2f} V, falling by {falls:.1f} V/s: full power lifts {shares[-1]:.2f} of it"
-                faults.append(Fault(Event.LIFT, text))
+                lifts = f"full power lifts {shares[-1]:.2f} times its share of the weight"
+                faults.append(Fault(Event.LIFT, f"{name} at {level:.2f} V, falling by {falls:.1f} V/s: {lifts}"))
         self.shares = shares
         return faults
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,11 @@ EXPECTED = {
     "sent": "finite numbers",
 }
 LEAP, LOST = (0.1, 10.0), 1.0  # [m], [m/s] beyond which a position is a leap; [s] for which a tracker may be elsewhere
+# What a pose's changes over those that are said tell of a unit: SI's in the other one's, and whose it is.
+UNITS = {
+    "velocity": ((1000.0, "position", "mm"), (100.0, "position", "cm"), (0.001, "velocity", "mm/s")),
+    "rates": ((math.pi / 180, "body rate", "deg/s"),),
+}
 AXES = ("the world's axes", "the drone's axes")
 USUAL = {"velocity": AXES[0], "along": AXES[1], "rates": AXES[1]}  # of quantities whose axes the poses tell
 WRONG = 0.7  # share of what moves by which what is said may be wrong; 0.2 to 0.4 in public flights (NanoBench)
@@ -111,9 +117,12 @@ def _in_axes(path: Path, own: Drone, quantity: str, name: str, remark: Callable[
     most = max(2 * least, WRONG * motions[usual].size)
     errors = {axes: f"{one.error:.2g} {unit}" for axes, one in motions.items()}
     if min(one.error for one in motions.values()) > most:
+        ratios = [one.ratio for one in motions.values()]
+        units = UNITS["rates" if quantity == "rates" else "velocity"]
+        likely = [f"; is its {what} in {one}?" for by, what, one in units if any(0.8 < r / by < 1.25 for r in ratios)]
         raise InputError(
             f"{path}: {called(quantity)} of {name} is not that of its poses, {errors[usual]} wrong in {usual} and "
-            f"{errors[other]} in {other}; expected {most:.2g} {unit} or less"
+            f"{errors[other]} in {other}; expected {most:.2g} {unit} or less{''.join(likely)}"
         )
     if motions[usual].error <= max(least, 2 * motions[other].error):
         return time, options[usual]

@@ -42,7 +42,7 @@ from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
-from mjxball.fly.uri import HERE, Udp, check_pair, parse_uri, share_dongle
+from mjxball.fly.uri import HERE, Udp, Uri, check_pair, parse_uri, share_dongle
 from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 
@@ -138,8 +138,8 @@ def _add_mocap(group: argparse._ArgumentGroup) -> None:
     add("--mocap-option", action="append", default=[], metavar="KEY=VALUE", help=about)
 
 
-def mocap_settings(options: argparse.Namespace) -> MocapSettings | None:
-    """What the flags ask for, None without --mocap. Raises InputError for anything unsound."""
+def mocap_settings(options: argparse.Namespace, links: Sequence[Uri]) -> MocapSettings | None:
+    """What the flags ask for both drones' `links`, None without --mocap. Raises InputError for anything unsound."""
     if options.mocap is None:
         for name in ("mocap_host", "bodies", "mocap_rate", "mocap_std", "mocap_option"):
             if getattr(options, name):
@@ -153,7 +153,8 @@ def mocap_settings(options: argparse.Namespace) -> MocapSettings | None:
         raise InputError("--mocap needs --bodies LEADER FOLLOWER, the names of the two rigid bodies")
     if options.bodies[0] == options.bodies[1]:
         raise InputError("--bodies names one body for both drones")
-    rate = options.mocap_rate or default_rate((options.leader, options.follower))
+    # 400 packets a second would fill a dongle that both drones share.
+    rate = options.mocap_rate or (50.0 if share_dongle(links) else 100.0)
     if not 50 <= rate <= 100:
         raise InputError(f"--mocap-rate must be 50 to 100, not {rate:g}")
     deviation = tuple(options.mocap_std or MocapSettings.deviation)
@@ -186,17 +187,11 @@ def parameters_of(options: argparse.Namespace, swarm: CrazyswarmPair | None) -> 
     return found + ([(options.gains, read_gains(options.gains))] if options.gains else [])
 
 
-def default_rate(uris: Sequence[str | None]) -> float:
-    """Poses a second to each drone: 100, and 50 where both share one dongle, which 400 packets a second would fill."""
-    links = [parse_uri(uri, f"--{name}") if uri else None for name, uri in zip(limits.NAMES, uris, strict=True)]
-    return 50.0 if share_dongle(links) else 100.0
-
-
-def check_options(options: argparse.Namespace) -> None:
-    """Raise InputError for anything unsound."""
+def check_options(options: argparse.Namespace) -> list[Uri]:
+    """The drones' links, as far as they are given. Raises InputError for anything unsound."""
     if importlib.util.find_spec("cflib") is None:
         raise InputError("cflib is not installed; pip install 'mjxball[fly]'")
-    links = []
+    links: list[Uri] = []
     for flag in limits.NAMES:
         uri = getattr(options, flag)
         if uri is None and not options.rehearse:
@@ -215,6 +210,7 @@ def check_options(options: argparse.Namespace) -> None:
     if options.log is not None:
         check_log(options.log, viewed=options.view is not None)
     check_view(options)
+    return links
 
 
 def check_view(options: argparse.Namespace) -> None:
@@ -233,8 +229,11 @@ def check_log(log: Path, viewed: bool) -> None:
         raise InputError(f"log file {log} must end in .jsonl or .mcap; mjxball.export makes other formats of it")
     if not log.absolute().parent.is_dir():
         raise InputError(f"the directory of log file {log} does not exist")
-    if log.suffix == ".mcap" and importlib.util.find_spec("mcap_ros2") is None:
-        raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'")
+    if log.suffix == ".mcap":
+        try:
+            importlib.import_module("mcap_ros2.writer")  # with what it needs itself
+        except ImportError:
+            raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'") from None
     if log.suffix == ".mcap" and viewed:
         raise InputError("--view follows a log of JSON lines: --log FILE.jsonl")
 
@@ -295,9 +294,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def command() -> int:
         swarm = crazyflies(options)
-        check_options(options)
+        links = check_options(options)
         check_twin_options(options)
-        capture = mocap_settings(options)
+        capture = mocap_settings(options, links)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy(load_policy(options.policy), options.policy.stem)
         controller = Controller(policy)

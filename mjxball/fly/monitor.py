@@ -293,7 +293,8 @@ class UplinkWatch:
     def frozen(self) -> Fault:
         """Of a drone that acts on nothing because it does nothing."""
         return Fault(
-            Event.FROZEN, f"all numbers of the {self._name} stand still: its IMU is dead, or its control hangs"
+            Event.FROZEN,
+            f"all numbers of the {self._name} stand still: its IMU is dead, or its control or its estimator hangs",
         )
 
     def sent(self, thrust: int, now: float) -> None:

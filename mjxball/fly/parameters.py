@@ -18,12 +18,12 @@ from mjxball.errors import InputError
 from mjxball.fly.card import is_crazyflie, with_curve
 from mjxball.fly.limits import NAMES
 from mjxball.fly.setpoints import CurveName
+from mjxball.reading import near
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
 NOISE = re.compile(r"\.(pN|mN|std|ext\w*Std)")  # standard deviations, which a filter divides by
 DEVIATIONS = (1e-6, 1e3)  # of them
-LARGEST = 1e5  # of a gain; shipped ones go to 1900
 SPARE = 1.5  # by which the loop's gain may be wrong either way: motors, battery, inertia
 RANGE = 3.0  # factor of the bandwidth, either way: at a third of the gains the shipped loops have 0.38 of theirs
 
@@ -53,10 +53,13 @@ def _check_value(parameter: str, value: float, where: str) -> None:
     if not is_written(parameter):
         groups = ", ".join(ESTIMATION)
         raise InputError(
-            f"{where} is neither a gain of pid_attitude or pid_rate nor a setting of {groups}: leave it out"
+            f"{where} is neither a gain of pid_attitude or pid_rate nor a setting of {groups}"
+            f"{near(parameter, PARAMETERS)}: leave it out"
         )
-    if parameter in PARAMETERS and not 0 <= value <= LARGEST:
-        raise InputError(f"{where} must be 0 to {LARGEST:g}, not {value:g}")
+    if parameter in PARAMETERS:
+        low, high = configs.range_of(f"autopilot.{PARAMETERS[parameter][0]}")
+        if not low <= value <= high:
+            raise InputError(f"{where} must be {low:g} to {high:g}, not {value:g}")
     low, high = DEVIATIONS
     if NOISE.search(parameter) and not low <= value <= high:
         raise InputError(f"{where} must be {low:g} to {high:g}, not {value:g}")

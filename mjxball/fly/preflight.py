@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mjxball.control import motors, rotations
-from mjxball.control.crazyflie import Gains, PairGains, read_pair_gains
+from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains, read_pair_gains
 from mjxball.control.motors import Motor
 from mjxball.errors import InputError
 from mjxball.files import read_text
@@ -32,7 +32,7 @@ from mjxball.fly.process import together, wait_until
 from mjxball.fly.setpoints import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.supervisor import Event, Fault
 from mjxball.fly.telemetry import DroneLink, Note, Rig, yaw_of
-from mjxball.reading import parse_json
+from mjxball.reading import near, parse_json
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,11 @@ def read_gains(path: Path) -> PairGains:
     try:
         return read_pair_gains(data)
     except ValueError:
+        known = (*NAMES, *PARAMETERS)
+        other = next((name for name in data if name not in known), "") if isinstance(data, dict) else ""
         raise InputError(
-            f"gain file {path} must be one JSON object of parameter names with finite numbers, or two of them, named "
-            "leader and follower"
+            f'gain file {path} must be JSON of finite numbers, {{"pid_attitude.roll_kp": 6, ...}} for both drones or '
+            f'{{"leader": {{...}}, "follower": {{...}}}}{near(other, known, 0.5)}'
         ) from None
 
 

@@ -87,7 +87,7 @@ class Rehearsal(Child):
         return RehearsalError(clock.too_slow(f"the twin is up to {late:.2f} s behind")) if late > LATE else None
 
     def end(self) -> str:
-        """Leave the twin; where the object is once its motors are off, one sentence."""
+        """Leave the twin; where the object is once its motors are off, and which faults never came, in a line each."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -97,8 +97,9 @@ class Rehearsal(Child):
         x, y, z = self._report["place"]
         motors = "on" if self._report["turning"] else "off"
         late = 1e3 * self._report["most_behind"]
+        never = "".join(f"\ntwin: --fault {one} never came: the flight had ended" for one in self._report["never"])
         place = f"the object is at ({x:+z.2f}, {y:+z.2f}, {z:+z.2f}) m from where it stood"
-        return f"twin: {place}, motors {motors}; the twin was at most {late:.0f} ms behind"
+        return f"twin: {place}, motors {motors}; the twin was at most {late:.0f} ms behind{never}"
 
     def close(self) -> None:
         """End it, at once."""

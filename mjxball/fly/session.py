@@ -25,7 +25,7 @@ from mjxball.fly.display import Display, listening
 from mjxball.fly.figures import LEAST, SETTLING
 from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.limits import NAMES, Check, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Preflight, check, prepare
@@ -155,7 +155,8 @@ def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
         except RehearsalError:
             raise
         except BaseException as error:  # nothing in here may leave thrust on, or let a pair fall that flies
-            flight.note("error", text=f"{type(error).__name__}: {error}")
+            with contextlib.suppress(Exception):
+                flight.note("error", text=f"{type(error).__name__}: {error}")
             if flight.flying:
                 _leave(flight, error, save, terminal_in_use.close)
             _emergency(flight)
@@ -200,6 +201,7 @@ def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings
         checks += setup.mocap.checks()
         setup.mocap.guarding = True
     checks += [] if setup.apps is None else map(check_ready, links)
+    checks += [Check("log", False, f"{journal.failure}: choose another --log")] if journal.failure else []
     if not all(one.passed for one in checks) and (slow := setup.excuse()):
         raise slow
     for one in checks:
@@ -232,8 +234,8 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
     if cause is None and stayed:
         _say("it did not lift: is it heavier than its plant, or does a propeller give less?")
     if flight.settings.dry_run and flight.highest:
-        text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
-        _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
+        text = ", ".join(f"{units} ({name})" for name, units in zip(NAMES, flight.highest, strict=True))
+        _say(f"dry run: zeros were sent; to a pair that does not lift it would have sent up to {text} thrust units")
     if flight.settings.dry_run and setup.mocap is not None:
         _say(
             f"axes: not shown yet: {flight.carry}" if flight.carry else "axes: every turn and way agrees with the IMUs"
@@ -241,7 +243,7 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
     if supervisor.cause is None and not (figures or flight.settings.dry_run):
-        _say(f"no error of the flight: it takes {SETTLING:g} s to settle and {LEAST:g} s to measure (--seconds)")
+        _say(f"hover error not measured: --seconds must allow {SETTLING:g} s to settle and {LEAST:g} s more")
     if figures is not None:
         _say(str(figures))
     if journal.failure:

@@ -104,7 +104,7 @@ def _host(name: str, where: str) -> str:
     return HERE if address.is_loopback or address.is_unspecified else found
 
 
-def share_dongle(links: Sequence[Uri | None]) -> bool:
+def share_dongle(links: Sequence[Uri]) -> bool:
     """Whether both links are of one radio dongle."""
     one, other = links
     return isinstance(one, Radio) and isinstance(other, Radio) and one.dongle == other.dongle

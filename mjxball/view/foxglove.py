@@ -6,11 +6,12 @@ shows, wherever it is from, so that the origin decides who is answered; Foxglove
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import http
 import json
 import logging
-import queue
+import socket
 import struct
 import threading
 from typing import Any
@@ -19,6 +20,7 @@ from urllib.parse import urlsplit
 from mjxball.errors import InputError
 from mjxball.fly.log_schema import Record
 from mjxball.fly.messages import Encoder
+from mjxball.fly.process import bounded
 from mjxball.reading import parse_json
 
 HOST = "127.0.0.1"
@@ -26,6 +28,7 @@ PROTOCOL: Any = "foxglove.sdk.v1"
 DATA = struct.Struct("<BIQ")  # before a message's bytes: 1, subscription, time [ns]
 BACKLOG = 1024  # messages that wait for one client; whoever is slower misses the oldest
 LARGEST = 2**16  # bytes that a client may say at once
+FAREWELL = 1.0  # [s] that a client has for closing the connection when the flight has ended
 OWN = (HOST, "localhost")
 FOXGLOVE = "https://app.foxglove.dev"
 
@@ -63,11 +66,11 @@ class Foxglove:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
         with self._lock:
             left = list(self._clients)
         for client in left:
             client.close()
+        self._server.shutdown()
 
     @property
     def address(self) -> str:
@@ -129,28 +132,36 @@ class _Client:
     def __init__(self, plug: Any):
         self.wanted: dict[int, int] = {}  # channel by the number of its subscription
         self._plug = plug
-        self._waiting: queue.Queue[str | bytes | None] = queue.Queue(BACKLOG)
+        self._waiting: collections.deque[str | bytes | None] = collections.deque()
+        self._news = threading.Condition()
 
     def tell(self, message: str | bytes | None) -> None:
-        """Send `message`, later; None is the last."""
-        while True:
-            try:
-                return self._waiting.put_nowait(message)
-            except queue.Full:
-                with contextlib.suppress(queue.Empty):
-                    self._waiting.get_nowait()
+        """Send `message`, later; None is the last. Of too many the oldest data are left out, and no text is."""
+        with self._news:
+            data = (place for place, one in enumerate(self._waiting) if isinstance(one, bytes))
+            if len(self._waiting) >= BACKLOG and (oldest := next(data, None)) is not None:
+                del self._waiting[oldest]
+            self._waiting.append(message)
+            self._news.notify()
 
     def close(self) -> None:
-        """Part from the client."""
-        self._plug.close()
+        """Part from the client; one that does not read would hold that up for ever, and is cut off."""
+        if not bounded(self._plug.close, FAREWELL):
+            with contextlib.suppress(OSError):
+                self._plug.socket.shutdown(socket.SHUT_RDWR)
 
     def send(self) -> None:
         """Send what waits, to the last."""
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):
-            while (message := self._waiting.get()) is not None:
+            while (message := self._next()) is not None:
                 self._plug.send(message)
+
+    def _next(self) -> str | bytes | None:
+        with self._news:
+            self._news.wait_for(lambda: self._waiting)
+            return self._waiting.popleft()
 
 
 def _check(plug: Any, request: Any) -> Any:

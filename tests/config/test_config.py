@@ -16,12 +16,6 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import load_file
 
-LARGE = {
-    "sac.total_steps",
-    "sac.warmup_steps",
-    "ppo.total_steps",
-    "sac.replay_size",
-}  # of which a billion may be wanted
 PATHS = [path for path, _, _ in configs.leaves(Config())]
 each_preset = rows("name", configs.PRESETS)
 each_leaf = rows("path", PATHS)
@@ -245,21 +239,37 @@ class TestValidate:
         assert path in refusal(configs.replace(Config(), path, changed))
 
     def test_no_setting_takes_what_no_flight_or_training_has(self):
-        """Of every number of every setting: what float32 does not hold, a billion, and what is beside its range."""
+        """Of every number of every setting: what float32 does not hold, and what is beside its range."""
         tried = 0
         for path, value, item in configs.leaves(configs.preset("transport")):
             if isinstance(value, (bool, str)):
                 continue
             low, high = item.metadata["low"], item.metadata["high"]
             whole = "int" in str(item.type)
-            wrong = [low - 1, 2 * high, 10**300, -(10**300), *([] if path in LARGE else [10**9])]
+            wrong = [low - 1, 2 * high, 10**300, -(10**300)]
             for number in wrong if whole else [*map(float, wrong), 1e-320, -1e-320]:
                 changed = (number,) * max(1, len(value)) if isinstance(value, tuple) else number
                 said = refusal(configs.replace(configs.preset("transport"), path, changed))
                 assert path in said, (path, number)
                 assert len(said) < 200, (path, number)
                 tried += 1
-        assert tried > 900
+        assert tried > 800
+
+    @rows(
+        ("path", "text"),
+        [
+            ("plant.rotor_lag", "1e-5"),  # next to none
+            ("plant.yaw_per_thrust", "1e-6"),
+            ("leader.integral_error_limit", "1e9,1e9,1e9"),  # no limit
+            ("scenario.termination_distance", "1e9"),
+            ("scenario.rotor_lag_scale", "0.001,1"),
+            ("sac.policy_layers", ",".join(["8"] * 100)),
+            ("sac.learning_rate_final_ratio", "1e-9"),
+            ("reward.termination", "1e8"),
+        ],
+    )
+    def test_what_is_next_to_nothing_or_next_to_endless_is_taken(self, path, text):
+        configs.validate(configs.override(configs.preset("transport"), path, text))
 
     def test_no_tuple_is_endless(self):
         for path in ("sac.policy_layers", "follower.observation_averages", "scenario.team_sizes"):

@@ -252,7 +252,7 @@ def test_poses_that_stand_still_in_the_ramp_end_it_on_the_ground() -> None:
     world.fly_until(State.RAMP)
     world.fly_for(0.2)
     for drone in world.drones:
-        drone.inject(FAULT_KINDS["pose-frozen"])
+        drone.inject(FAULT_KINDS["pose-frozen"].what)
     world.run(15.0)
     assert world.flight.supervisor.cause.event is Event.ESTIMATOR
     assert max(moment.position[2] for moment in world.track) - world.rest < 0.005

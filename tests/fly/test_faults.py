@@ -41,7 +41,7 @@ def hovering(seconds: float = 20.0, height: float = HEIGHT, flown: float = 3.0) 
 def after(world: VirtualTwin, kind: str, *drones: int) -> list[Moment]:
     """What came of a fault `kind` of some drones, until all is off."""
     for drone in drones:
-        world.drones[drone].inject(FAULT_KINDS[kind])
+        world.drones[drone].inject(FAULT_KINDS[kind].what)
     begin = len(world.track)
     world.run(15.0)
     assert not any(world.running())
@@ -75,7 +75,7 @@ def test_uplinks_lost_one_soon_after_the_other_leave_the_stick_level(first: int)
     turned the stick over. Noticed before, the second keeps a thrust by which both are down first.
     """
     world = hovering()
-    world.drones[first].inject(FAULT_KINDS["silent-up"])
+    world.drones[first].inject(FAULT_KINDS["silent-up"].what)
     world.fly_for(0.3)
     track = after(world, "silent-up", 1 - first)
     assert max(moment.tilt for moment in track) < math.radians(30)
@@ -89,7 +89,7 @@ def test_poses_that_freeze_one_after_the_other_leave_no_thrust_on_the_ground() -
     """
     world = hovering()
     began = world.now
-    world.drones[0].inject(FAULT_KINDS["pose-frozen"])
+    world.drones[0].inject(FAULT_KINDS["pose-frozen"].what)
     world.fly_for(0.03)
     track = after(world, "pose-frozen", 1)
     assert world.touchdown_speed() < 0.7

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -221,10 +222,23 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
         assert not any(drone.firmware.locked for drone in world.drones)
         speed = world.touchdown_speed()
         assert not speed > 0.8, (phase, speed)
-    world.flight.supervisor, world.flight.watchdog = Supervisor(State.FLY), None
+
+    def note(*_: object, **fields: object) -> None:
+        raise OSError("no log")
+
+    world.flight.supervisor, world.flight.watchdog, world.flight.note = Supervisor(State.FLY), None, note
     with pytest.raises(Ended):  # the laws on board: nobody else takes over, and the apps land
         session.run(world.flight)
     assert "the apps on board land both drones" in capsys.readouterr().err
+
+
+def test_a_log_that_is_not_written_keeps_the_pair_on_the_ground(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(session, "check", lambda *_: [])
+    nobody = SimpleNamespace(mocap=None, apps=None, excuse=lambda: None, rig=None, preflight=None)
+    for failure in (None, "No space left on device"):
+        journal = SimpleNamespace(failure=failure, note=lambda *_, **fields: None)
+        assert session._checked([], nobody, FlightSettings(), journal) is (failure is None)
+    assert "log: No space left on device" in capsys.readouterr().out
 
 
 def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.connection import Deadlines, LinkError
+from mjxball.fly.connection import REACH, Deadlines, LinkError
 from mjxball.fly.link import Link
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.preflight import Preflight, reset_estimator
@@ -204,6 +204,13 @@ def test_nobody_there() -> None:
     link = Link(f"udp://{HOST}:{port}", "leader", nothing, SHORT)
     with pytest.raises(InputError, match="cannot be reached"):
         link.open()
+
+
+def test_a_dongle_that_is_not_there_is_not_the_drones_fault() -> None:
+    link = Link("radio://ABCDEF0123/80/2M/E7E7E7E7E7", "leader", nothing, SHORT)
+    with pytest.raises(InputError, match="plug a Crazyradio in") as error:
+        link.open()
+    assert REACH not in str(error.value)
 
 
 def test_somebody_who_never_answers() -> None:

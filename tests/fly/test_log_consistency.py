@@ -8,7 +8,7 @@ from tables import rows
 
 from mjxball.control.rotations import integrate_quaternion
 from mjxball.fly import log_consistency
-from mjxball.fly.log_consistency import TURNING, known, lag, turn, way
+from mjxball.fly.log_consistency import TURNING, faults, known, lag, turn, way
 from mjxball.fly.log_sources import Samples
 
 STEP = 0.01  # [s]
@@ -67,6 +67,34 @@ def test_motion_tells_the_speed_of_its_clock(faster: float) -> None:
     for found in (moved, turned):
         assert found.ratio == pytest.approx(1 / faster, abs=0.01)
         assert found.error == pytest.approx(abs(1 / faster - 1) * found.size * faster, abs=0.1 * found.size)
+
+
+@rows(
+    ("moves", "turns", "wrong"),
+    [
+        (1.0, 1.0, False),
+        (1.2, 1.0, False),  # a Kalman filter's velocities, in public flights
+        (1.0, 0.85, False),
+        (1.2, 0.85, False),
+        (1.3, 1.3, True),
+        (0.77, 0.77, True),
+        (0.5, 1.0, True),
+        (1.0, 57.3, True),
+    ],
+)
+def test_a_clock_is_wrong_where_positions_and_attitudes_agree_that_it_is(
+    moves: float, turns: float, wrong: bool
+) -> None:
+    """They change by these factors of velocities and rates; one of both must be far off to count by itself."""
+    time = np.arange(0, 10, STEP)
+    velocity = rates(time)[1]
+    attitudes = [np.array([1.0, 0.0, 0.0, 0.0])]
+    for one in velocity[:-1]:
+        attitudes.append(integrate_quaternion(attitudes[-1], one * STEP))
+    places = np.cumsum(velocity, axis=0) * STEP
+    states = time, np.concatenate([places, velocity / moves, np.array(attitudes), velocity / turns], axis=1)
+    sent = np.zeros((len(time), 2, 4)) + 30000.0
+    assert len(faults((time, sent), [states, states])) == (2 if wrong else 0)
 
 
 def test_nothing_is_known_within_a_hole() -> None:

@@ -363,19 +363,18 @@ def test_an_odometry_s_axes_are_those_in_which_it_agrees_with_its_poses(tmp_path
             np.testing.assert_allclose(row, truth[time], atol=1e-6)
         assert any("velocity of cf231 is taken in the drone's axes" in text for text in told) is linear
         assert any("body rate of cf231 is taken in the world's axes" in text for text in told) is angular
-    for name, factors, reason in (
-        ("mm", (1000.0, 1.0), r"velocity of cf(7|231) is not that of its poses, .* m/s wrong in the world's axes and"),
-        ("back", (-1.0, 1.0), r"velocity of cf(7|231) is not that of its poses, 0\.\d+ m/s wrong in the world's axes"),
-        (
-            "degrees",
-            (1.0, 57.3),
-            r"body rate of cf(7|231) .* rad/s wrong in the drone's axes and [\d.]+ rad/s in the w",
-        ),
+    unlike = r" of cf(7|231) is not that of its poses, [\d.e+]+ {} wrong in the {}'s axes and .* or less"
+    of_velocity, of_rates = unlike.format("m/s", "world"), unlike.format("rad/s", "drone")
+    for name, by, reason in (
+        ("mm", {"position": 1000.0}, rf"velocity{of_velocity}; is its position in mm\?$"),
+        ("cm", {"position": 100.0}, rf"velocity{of_velocity}; is its position in cm\?$"),
+        ("mm/s", {"velocity": 1000.0}, rf"velocity{of_velocity}; is its velocity in mm/s\?$"),
+        ("back", {"velocity": -1.0}, rf"velocity{of_velocity}$"),
+        ("degrees", {"rates": 57.3}, rf"body rate{of_rates}; is its body rate in deg/s\?$"),
     ):
-        by = {"velocity": factors[0], "rates": factors[1]}
         wrong = moving(records, lambda state, by=by: {key: by[key] * getattr(state, key) for key in by})
         with pytest.raises(InputError, match=reason):
-            states_of(write_bag(tmp_path / name, wrong, odometry=True, spin=True), [])
+            states_of(write_bag(tmp_path / name.replace("/", ""), wrong, odometry=True, spin=True), [])
 
 
 def test_cfclient_s_two_clocks_are_brought_together(tmp_path: Path) -> None:

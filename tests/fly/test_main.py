@@ -62,24 +62,41 @@ def test_refusals(arguments: list[object], reason: str, capsys: pytest.CaptureFi
     assert_one_line(errors)
 
 
-@pytest.mark.parametrize(
-    "text",
+@rows(
+    ("text", "near"),
     [
-        "[1]",
-        "{",
-        '{"leader": {}}',
-        '{"leader": {}, "follower": 1}',
-        '{"a": 1}',
-        '{"a.b": "x"}',
-        '{"a.b": true}',
-        '{"a.b": NaN}',
+        ("[1]", ""),
+        ("{", ""),
+        ('{"leader": {}}', ""),
+        ('{"leader": {}, "follower": 1}', ""),
+        ('{"leder": {}, "follower": {}}', "leader"),
+        ('{"roll_kp": 6}', "pid_attitude.roll_kp"),
+        ('{"pid_attitud.roll_kp": 6}', "pid_attitude.roll_kp"),
+        ('{"a": 1}', ""),
+        ('{"a.b": "x"}', ""),
+        ('{"a.b": true}', ""),
+        ('{"a.b": NaN}', ""),
     ],
 )
-def test_gain_files_that_are_none(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gain_files_that_are_none(text: str, near: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gains.json"
     path.write_text(text)
     assert call(main, [TRANSPORT, *URIS, "--gains", path]) == 2
-    assert "gain file" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert str(path) in errors
+    assert ("did you mean" in errors) == bool(near)
+    assert near in errors
+
+
+def test_an_install_that_cannot_write_mcap_is_refused(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """Found out by the process that writes it, it was a flight without a log."""
+    for missing in ("mcap_ros2", "mcap.writer"):
+        with monkeypatch.context() as changed:
+            for name in [one for one in sys.modules if one.startswith("mcap")]:
+                changed.delitem(sys.modules, name)
+            changed.setitem(sys.modules, missing, None)
+            assert call(main, [TRANSPORT, *URIS, "--log", "flight.mcap"]) == 2
+            assert "pip install 'mjxball[logs]'" in capsys.readouterr().err
 
 
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
@@ -145,7 +162,7 @@ def test_a_flight_with_no_name_for_its_log_gets_one(tmp_path: Path) -> None:
 
 KINDS = {
     "rehearsed": ["--seconds", "2", "--gains", "gains.json", "--loss", "0.1", "--delay", "0.01", "--jitter", "0.005"],
-    "dry": ["--seconds", "1", "--dry-run"],
+    "dry": ["--seconds", "1", "--dry-run", "--fault", "weak:leader@0"],  # which waits for a motor to turn
     "interrupted": ["--seconds", "60"],
     "terminated": ["--seconds", "60", "--thrust", "paper", "--hover", "47000"],
 }
@@ -243,6 +260,7 @@ def test_a_dry_run(flights: dict[str, Ended]) -> None:
     flight = flights["dry"]
     assert (flight.code, flight.states()) == (0, NORMAL)
     assert "would have sent" in flight.out
+    assert "weak:leader@0 never came" in flight.out.splitlines()[-1]
     assert any(tick["sent"][0][3] > 10000 for tick in flight.ticks("fly"))
     assert max(tick["observation"][2] for tick in flight.ticks("fly")[1:]) < 0.01  # nothing has lifted
 

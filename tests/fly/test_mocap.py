@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from command_line import TRANSPORT, assert_one_line, call
 from fly_virtual import VirtualTwin
+from tables import rows
 from vrpn_server import Poses, VrpnServer
 from wire import unpack_pose
 
@@ -23,7 +24,7 @@ from mjxball.fly import mocap as motion_capture
 from mjxball.fly import packets, process
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.link import Link
-from mjxball.fly.main import default_rate, main
+from mjxball.fly.main import check_options, main, make_parser, mocap_settings
 from mjxball.fly.mocap import Mocap, MocapError, MocapSettings, ready
 from mjxball.fly.mocap_child import Decimation
 from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose
@@ -225,11 +226,14 @@ def test_frames_are_thinned_to_the_rate_and_no_further() -> None:
         assert np.diff(passed).max() < 2.1 / min(source, wanted)
 
 
-def test_the_rate_is_halved_where_two_drones_share_a_dongle() -> None:
-    one, other = "radio://0/80/2M/E7E7E7E7E7", "radio://0/80/2M/E7E7E7E7E8"
-    assert default_rate((one, other)) == 50
-    assert default_rate((one, other.replace("//0/", "//1/"))) == 100
-    assert default_rate(("udp://127.0.0.1:1", None)) == 100
+@rows(
+    ("follower", "rate"),
+    [("radio://0/80/2M/E7E7E7E7E8", 50), ("radio://1/90/2M/E7E7E7E7E8", 100), ("udp://127.0.0.1:1", 100)],
+)
+def test_the_rate_is_halved_where_two_drones_share_a_dongle(follower: str, rate: float) -> None:
+    pair = ["--leader", "radio://0/80/2M/E7E7E7E7E7", "--follower", follower]
+    options = make_parser().parse_args(["flight", *pair, *MOCK])
+    assert mocap_settings(options, check_options(options)).rate == rate
 
 
 class Driver:

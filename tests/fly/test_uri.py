@@ -83,4 +83,4 @@ def test_which_two_links_fly() -> None:
             check_pair(*links)
     links = [parse_uri(text, "") for text in ("radio://e7e7e7e7ab/80", "radio://E7E7E7E7AB/80/2M/E7E7E7E7E8")]
     assert share_dongle(links)
-    assert not share_dongle([links[0], None])
+    assert not share_dongle([links[0], parse_uri("udp://127.0.0.1:1", "")])

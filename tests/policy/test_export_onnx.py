@@ -59,6 +59,7 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str):
     """At a start and between sound ones: its row says so, is level, and flies on as without; others notice nothing."""
     contents, bad = contents_of(name), np.arange(2 * len(SPOILT)) % 2 == 0
     model, alone = Model(contents), Policy(contents, name)
+    assert model.fly(walk(2, 0))["command"].shape == (2, 0, 3)
     for count in (1, 4):
         flight, row = walk(len(bad), count), count // 2
         others, spoilt = np.arange(count) != row, flight.copy()
@@ -74,6 +75,7 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str):
             np.testing.assert_array_equal(values[~bad, row], without[label][:, row])
             assert np.isfinite(values).all()
             assert not values[bad, row].any() or label == "next_memory"
+        assert list(found) == ["action", "command", *(["next_memory"] if model.size else []), "valid"]
         if model.size:
             np.testing.assert_array_equal(found["next_memory"][2::2, row], found["next_memory"][1:-1:2, row])
 

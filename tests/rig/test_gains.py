@@ -175,7 +175,7 @@ class TestCommand:
             ('{"sac.total_steps": 3}', "may set"),
             ('{"plant.mass": 3}', "not a setting"),
             ('{"plant.rotor_lag": "slow"}', "takes numbers"),
-            ('{"plant.rotor_lag": -1}', "between 0.0001 and"),
+            ('{"plant.rotor_lag": -1}', "between 1e-09 and"),
         ],
     )
     def test_plant_files_are_refused_in_a_sentence(self, tmp_path: Path, capsys, text: str, said: str) -> None:

@@ -19,6 +19,7 @@ from mjxball.fly import flight_log
 from mjxball.fly.display import live_view
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
+from mjxball.fly.process import bounded
 from mjxball.view.foxglove import Foxglove
 from mjxball.view.main import main as view
 
@@ -27,7 +28,7 @@ exceptions = pytest.importorskip("websockets.exceptions")
 typesys = pytest.importorskip("rosbags.typesys")
 DATA = struct.Struct("<BIQ")  # kind of message, subscription, time [ns]. https://github.com/foxglove/ws-protocol
 PATIENCE = 20.0  # [s]
-SUBSCRIBE = '{{"op": "subscribe", "subscriptions": [{{"id": {}, "channelId": 1}}]}}'
+SUBSCRIBE = '{{"op": "subscribe", "subscriptions": [{{"id": {}, "channelId": {}}}]}}'
 HANDSHAKE = (
     "GET / HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
     "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
@@ -56,6 +57,26 @@ def heard(plug: Any, operation: str) -> dict[str, Any]:
             return told
 
 
+def message(plug: Any, subscription: int, patience: float = PATIENCE) -> bytes:
+    """The next message of one `subscription`. Raises TimeoutError."""
+    while True:
+        found = plug.recv(timeout=patience)
+        if isinstance(found, bytes) and DATA.unpack_from(found)[:2] == (1, subscription):
+            return found
+
+
+def subscribe(server: Foxglove, plug: Any, subscription: int, channel: int) -> None:
+    """Return once the server has heard it. Only a message tells: it may answer a ping sooner than a text before it."""
+    probe = server.register_channel("/probe", "cdr", server.register_schema("x/msg/Probe", "ros2msg", b""))
+    plug.send(SUBSCRIBE.format(subscription, channel))
+    plug.send(SUBSCRIBE.format(0, probe))
+    while True:
+        server.add_message(probe, 0, b"", 0, 0)
+        with contextlib.suppress(TimeoutError):
+            message(plug, 0, 0.1)
+            return
+
+
 def test_a_foreign_client_reads_the_poses(records: list[dict[str, Any]]) -> None:
     half = len(records) // 2
     with Foxglove(0) as server:
@@ -68,8 +89,7 @@ def test_a_foreign_client_reads_the_poses(records: list[dict[str, Any]]) -> None
                 channels |= {one["topic"]: one for one in heard(plug, "advertise")["channels"]}
             pose = channels["/leader/pose"]
             assert (pose["encoding"], pose["schemaEncoding"]) == ("cdr", "ros2msg")
-            plug.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": pose["id"]}]}))
-            plug.ping().wait(PATIENCE)
+            subscribe(server, plug, 7, pose["id"])
             store = typesys.get_typestore(typesys.Stores.EMPTY)
             store.register(typesys.get_types_from_msg(pose["schema"], pose["schemaName"]))
             wanted, places = [], []
@@ -78,10 +98,8 @@ def test_a_foreign_client_reads_the_poses(records: list[dict[str, Any]]) -> None
                 if record["kind"] != "state" or record["drone"] != "leader":
                     continue
                 wanted.append(record["raw"].state.position)
-                found = plug.recv(timeout=PATIENCE)
-                kind, subscription, _ = DATA.unpack_from(found)
-                assert (kind, subscription) == (1, 7)
-                place = store.deserialize_cdr(found[DATA.size :], pose["schemaName"]).pose.position
+                found = message(plug, 7)[DATA.size :]
+                place = store.deserialize_cdr(found, pose["schemaName"]).pose.position
                 places.append([place.x, place.y, place.z])
     assert len(places) > 20
     np.testing.assert_array_equal(places, wanted)
@@ -135,7 +153,7 @@ def test_pages_of_elsewhere_are_refused() -> None:
 
 def test_a_client_that_says_anything_else_is_let_go_of_and_the_others_stay() -> None:
     with Foxglove(0) as server, client.connect(server.address, subprotocols=["foxglove.sdk.v1"]) as stays:
-        for text in ("nonsense", "[1]", "[" * 60_000, '{"op": "subscribe"}', SUBSCRIBE.format(2**40), "x" * 10**6):
+        for text in ("nonsense", "[1]", "[" * 60_000, '{"op": "subscribe"}', SUBSCRIBE.format(2**40, 1), "x" * 10**6):
             with client.connect(server.address, subprotocols=["foxglove.sdk.v1"]) as plug:
                 plug.send(text)
                 with contextlib.suppress(exceptions.ConnectionClosed):
@@ -143,28 +161,34 @@ def test_a_client_that_says_anything_else_is_let_go_of_and_the_others_stay() -> 
                         pass
         schema = server.register_schema("x/msg/Y", "ros2msg", b"float64 x")
         channel = server.register_channel("/y", "cdr", schema)
-        stays.send(SUBSCRIBE.format(3))
         stays.send('{"op": "unknown"}')
-        stays.ping().wait(PATIENCE)
+        subscribe(server, stays, 3, channel)
         server.add_message(channel, 5, b"12345678", 5, 0)
-        found: Any = ""
-        while isinstance(found, str):
-            found = stays.recv(timeout=PATIENCE)
-        assert found == DATA.pack(1, 3, 5) + b"12345678"
+        assert message(stays, 3) == DATA.pack(1, 3, 5) + b"12345678"
 
 
 def test_a_client_that_does_not_read_holds_nobody_up() -> None:
-    """What it misses is the oldest."""
-    with Foxglove(0) as server, client.connect(server.address, subprotocols=["foxglove.sdk.v1"]) as plug:
+    """What it misses are the oldest data, no topic; one that never reads is left behind when the flight ends."""
+    server = Foxglove(0)
+    with client.connect(server.address, subprotocols=["foxglove.sdk.v1"], compression=None, close_timeout=0.1) as plug:
         channel = server.register_channel("/y", "cdr", server.register_schema("x/msg/Y", "ros2msg", b"uint8[] x"))
-        plug.send(SUBSCRIBE.format(3))
-        plug.ping().wait(PATIENCE)
+        subscribe(server, plug, 3, channel)
         for number in range(3000):
             server.add_message(channel, number, bytes(20_000), number, 0)
-        last = 0
-        while last < 2999:
+            if number == 1000:
+                server.register_channel("/late", "cdr", 1)
+        times, texts = [0], ""
+        while times[-1] < 2999:
             found = plug.recv(timeout=PATIENCE)
-            last = DATA.unpack_from(found)[2] if isinstance(found, bytes) else last
+            if isinstance(found, str):
+                texts += found
+            else:
+                times.append(DATA.unpack_from(found)[2])
+        assert 1000 <= len(times) < 3000
+        assert "/late" in texts
+        for number in range(3000):
+            server.add_message(channel, number, bytes(20_000), number, 0)
+        assert bounded(server.__exit__, PATIENCE)
 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,6 @@ from conftest import opened
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
-from mjxball.errors import InputError
 from mjxball.fly.display import live_view
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
@@ -360,15 +359,22 @@ def test_a_log_that_turns_out_to_be_none(tmp_path: Path) -> None:
     assert "does not begin with a header" in errors
 
 
-def test_a_flight_starts_and_ends_its_view(lines: list[bytes], tmp_path: Path) -> None:
+def test_a_flight_starts_and_ends_its_view(
+    lines: list[bytes], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A view that cannot have its port says so itself, and no flight begins."""
     path = tmp_path / "log.jsonl"
     with live_view(path) as page_process:
         address = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:(\d+)/), and waits for .*", page_process.line)
         path.write_bytes(b"".join(lines))
         with urllib.request.urlopen(address[1], timeout=LIMIT) as page:
             assert page.status == 200
-        with pytest.raises(InputError, match="the port of --view"):
+        with pytest.raises(SystemExit) as ended:
             live_view(path, int(address[2]))
+        assert ended.value.code == 2
+        errors = capfd.readouterr().err
+        assert_one_line(errors)
+        assert address[2] in errors
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", int(address[2])), LIMIT)
 

@@ -57,14 +57,16 @@ def serve(options: argparse.Namespace) -> int:
     with urgent(), Twin(make_pair(card, kind, surroundings(options)), tuple(options.ports), cores) as twin:
         worse = LinkFaults(options.loss, options.delay, options.jitter)
         links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
-        for one in (*links, *options.fault):
-            threading.Thread(target=inject_later, args=(twin, one), daemon=True).start()
+        waiting = [*links, *options.fault]
+        for one in tuple(waiting):
+            threading.Thread(target=inject_later, args=(twin, one, waiting), daemon=True).start()
         report(uris=twin.uris)
         with contextlib.suppress(KeyboardInterrupt):
             attend(twin)
         weights = Rig.of_card(card).weights if card else (0.5, 0.5)
         place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
         found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
+        found["never"] = [one.text for one in waiting if one.text]
         report(**found, failure=str(twin.failure or ""), slow=isinstance(twin.failure, InputError))
     return 0
 
@@ -94,11 +96,12 @@ def report(**fields: Any) -> None:
         say(json.dumps(fields))
 
 
-def inject_later(twin: Twin, one: Injection) -> None:
-    """Wait for the first motor to turn, then until the fault is due."""
+def inject_later(twin: Twin, one: Injection, waiting: list[Injection]) -> None:
+    """Wait for the first motor to turn, then until the fault is due; it does not wait any more then."""
     while twin.truth.pwm.max() == 0 or max(twin.truth.thrust) == 0:
         clock.sleep(0.01)
     clock.sleep(one.after)
+    waiting.remove(one)
     twin.inject(one)
 
 

@@ -210,35 +210,44 @@ class BodyFault(NamedTuple):
     value: float
 
 
-# What `--fault KIND:DRONE@S` can be: faults of the link, of a drone, or what the twin does to it.
-What = LinkFaults | DroneFaults | BodyFault | str
-FAULT_KINDS: dict[str, What] = {
-    "silent": LinkFaults(silent_up=True, silent_down=True),
-    "silent-up": LinkFaults(silent_up=True),
-    "silent-down": LinkFaults(silent_down=True),
-    "loss": LinkFaults(loss=0.3),
-    "frozen": DroneFaults(frozen=True),
-    "clock": DroneFaults(clock_stopped=True),
-    "jump": DroneFaults(offset=(0.0, 0.0, 0.4)),
-    "battery": DroneFaults(battery=-1.2),
-    "garbage": DroneFaults(garbage=3.0),
-    "crash": "crash",
-    "power": "power",
-    "port": "port",
-    "reboot": "reboot",
-    "stabilizer": DroneFaults(stabilizer_dead=True),
-    "imu": DroneFaults(stabilizer_dead=True),  # the stabilizer waits for it
-    "stopped": DroneFaults(stopped=True),
-    "peer": DroneFaults(peer_silent=True),
-    "killed": DroneFaults(stopped=True, restarts=False),
-    "pose-frozen": BodyFault("frozen", 1.0),
-    "pose-axis": BodyFault("frozen z", 1.0),
-    "pose-repeated": BodyFault("repeated", 2.0),
-    "pose-lost": BodyFault("lost", 1.0),
-    "pose-jump": BodyFault("jump", 0.4),
-    "sag": BodyFault("battery", 3.0),
-    "fade": BodyFault("fade", 0.5),  # [V/s]
-    "weak": BodyFault("gain", 0.9),
+What = LinkFaults | DroneFaults | BodyFault | str  # faults of the link, of a drone, or what the twin does to it
+
+
+class FaultKind(NamedTuple):
+    """What `--fault KIND:DRONE@S` does."""
+
+    what: What
+    about: str  # of the drone or its link
+
+
+HUNG = DroneFaults(stabilizer_dead=True)
+FAULT_KINDS = {
+    "silent": FaultKind(LinkFaults(silent_up=True, silent_down=True), "no packet passes its link, either way"),
+    "silent-up": FaultKind(LinkFaults(silent_up=True), "no packet reaches it"),
+    "silent-down": FaultKind(LinkFaults(silent_down=True), "no packet comes from it"),
+    "loss": FaultKind(LinkFaults(loss=0.3), "30 % of the packets are lost, each way"),
+    "frozen": FaultKind(DroneFaults(frozen=True), "its estimate stands still, its clock goes on"),
+    "clock": FaultKind(DroneFaults(clock_stopped=True), "the time stamps of its states stand still"),
+    "jump": FaultKind(DroneFaults(offset=(0.0, 0.0, 0.4)), "the position that it reports jumps up by 0.4 m"),
+    "battery": FaultKind(DroneFaults(battery=-1.2), "it reports 1.2 V less than its battery has"),
+    "garbage": FaultKind(DroneFaults(garbage=3.0), "it sends 600 datagrams of random bytes a second"),
+    "crash": FaultKind("crash", "its firmware finds that it has crashed: motors off"),
+    "power": FaultKind("power", "its power fails"),
+    "port": FaultKind("port", "its radio task ends: packets are refused, motors run on"),
+    "reboot": FaultKind("reboot", "its power fails for a moment: it starts anew, motors off"),
+    "stabilizer": FaultKind(HUNG, "its stabilizer task hangs: motors are held, then its watchdog restarts it"),
+    "imu": FaultKind(HUNG, "its IMU ends, for which the stabilizer task waits: as `stabilizer`"),
+    "stopped": FaultKind(DroneFaults(stopped=True), "its program hangs: motors are held, then it restarts"),
+    "peer": FaultKind(DroneFaults(peer_silent=True), "`--onboard`: the other drone does not hear its app"),
+    "killed": FaultKind(DroneFaults(stopped=True, restarts=False), "as `stopped`, but it does not start again"),
+    "pose-frozen": FaultKind(BodyFault("frozen", 1.0), "its measured pose stands still"),
+    "pose-axis": FaultKind(BodyFault("frozen z", 1.0), "the height of its measured pose stands still"),
+    "pose-repeated": FaultKind(BodyFault("repeated", 2.0), "it is given each measured pose twice, at half the rate"),
+    "pose-lost": FaultKind(BodyFault("lost", 1.0), "it is given no measured pose"),
+    "pose-jump": FaultKind(BodyFault("jump", 0.4), "its measured position jumps up by 0.4 m"),
+    "sag": FaultKind(BodyFault("battery", 3.0), "its battery gives way, to 3.0 V"),
+    "fade": FaultKind(BodyFault("fade", 0.5), "its battery loses 0.5 V a second"),
+    "weak": FaultKind(BodyFault("gain", 0.9), "its motors give 10 % less"),
 }
 
 
@@ -248,6 +257,7 @@ class Injection(NamedTuple):
     what: What
     drone: int  # 0 leader, 1 follower
     after: float  # the first motor has turned [s]
+    text: str = ""  # that asked for it
 
 
 def read_fault(text: str) -> Injection:
@@ -257,4 +267,4 @@ def read_fault(text: str) -> Injection:
         raise InputError(
             f"--fault {text} is no KIND:DRONE@S such as frozen:follower@3; kinds: {', '.join(FAULT_KINDS)}"
         )
-    return Injection(FAULT_KINDS[match[1]], ("leader", "follower").index(match[2]), float(match[3]))
+    return Injection(FAULT_KINDS[match[1]].what, ("leader", "follower").index(match[2]), float(match[3]), text)

@@ -18,7 +18,7 @@ from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
 from mjxball.fly.twin.logs import Readings, Snapshot
 from mjxball.fly.twin.pair import Modes, Pair, PairState
-from mjxball.fly.twin.parameters import CONTROLLERS, ESTIMATOR, KALMAN, OF_APP, PARAMETERS
+from mjxball.fly.twin.parameters import ESTIMATOR, KALMAN, OF_APP, PARAMETERS
 from mjxball.fly.twin.positioning import DECKS
 from mjxball.fly.twin.protocol import Peer
 
@@ -80,19 +80,12 @@ class TwinDrone:
             setattr(self.firmware.supervisor, field, value * factor)
         if self.app is not None and name.startswith(f"{GROUP}."):
             self.app.set(name.removeprefix(f"{GROUP}."), value)
-        if name == CONTROLLER:
-            self._say_controller(int(value))
         self._pair.set_parameter(self.number, name, value)
 
     @property
     def controller(self) -> int:
         """Number of the controller in use."""
         return int(self.peer.values[CONTROLLER])
-
-    def _say_controller(self, number: int) -> None:
-        self.peer.tell(f"CONTROLLER: Using {CONTROLLERS[number]} ({number}) controller")
-        if number not in (PID, OUT_OF_TREE):
-            self.peer.tell("TWIN: it has no such controller, motors stay off")
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram came from the laptop."""

@@ -22,7 +22,7 @@ CLEARED = {"kalman.resetEstimation", "supervisor.infdmp", "syslink.probe", "syst
 CLEARED |= {"health.startPropTest", "health.startBatTest"}
 ESTIMATOR = "stabilizer.estimator"
 COMPLEMENTARY, KALMAN = 1, 2  # of its numbers
-CONTROLLERS = {PID: "PID", 2: "Mellinger", 3: "INDI", 4: "Brescianini", 5: "Lee", OUT_OF_TREE: "OutOfTree"}
+CONTROLLERS = {PID, 2, 3, 4, 5}  # PID, Mellinger, INDI, Brescianini, Lee
 MASSES = {"thrust-upgrade": 0.0325, "brushless": 0.0393}  # [kg] by motor, as the controllers of forces have it
 
 
@@ -86,9 +86,9 @@ class Values:
         """
         self.listed = PARAMETERS + (() if app is None else OF_APP)
         self.defaults = defaults_of(kind) | dict(decks or {}) | {one.name: one.default for one in OF_APP}
-        controllers = set(CONTROLLERS) - {OUT_OF_TREE}
+        controllers = CONTROLLERS
         if app is not None:  # the build of an app has its controller, and begins with it
-            controllers.add(OUT_OF_TREE)
+            controllers = {*CONTROLLERS, OUT_OF_TREE}
             self.defaults[CONTROLLER] = float(OUT_OF_TREE)
         # Numbers that the firmware knows, and which one 0 stands for.
         self._choices = {

@@ -31,7 +31,7 @@ from mjxball.fly.twin.parameters import Parameter, Values
 VERSION = 12
 MAX_DATA = 30
 GREETING = b"Bitcraze Crazyflie".ljust(30, b"\0")
-CONSOLE, PARAM, COMMANDER, MEMORY, LOG, LOCALIZATION, GENERIC, SUPERVISOR = 0, 2, 3, 4, 5, 6, 7, 9
+PARAM, COMMANDER, MEMORY, LOG, LOCALIZATION, GENERIC, SUPERVISOR = 2, 3, 4, 5, 6, 7, 9
 PLATFORM, LINK = 13, 15
 ADDRESS = 0xE7  # last byte of the radio's, by which packed poses are told apart
 EMERGENCY, KEEPALIVE, POSE, POSES = 3, 4, 8, 9  # kinds of generic localization packets
@@ -62,7 +62,6 @@ class Peer:
         known = LOG_VARIABLES + (() if app is None else OF_APP)
         variables = [item(LOG_TYPES[kind][0], name) for name, kind in known]
         self.logs = Blocks(known)
-        self._told = b""  # text for the console that was not sent yet
         self._on_pose = on_pose
         self._handlers: dict[tuple[int, int], Callable[[bytes, float], list[bytes] | None]] = {
             (LINK, 0): lambda data, now: [data],
@@ -97,16 +96,7 @@ class Peer:
         handler = self._handlers.get((port, channel))
         if handler is None:
             return []
-        answers = [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now) or ()]
-        return answers + self._console()
-
-    def tell(self, text: str) -> None:
-        """Have a line `text` go out on the console with the next answer."""
-        self._told += text.encode() + b"\n"
-
-    def _console(self) -> list[bytes]:
-        told, self._told = self._told, b""
-        return [bytes([header(CONSOLE, 0)]) + told[at : at + MAX_DATA] for at in range(0, len(told), MAX_DATA)]
+        return [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now) or ()]
 
     def log_data(self, readings: Readings | Mapping[str, float], now: float) -> list[bytes]:
         """The datagrams of all log blocks that are due at `now`."""

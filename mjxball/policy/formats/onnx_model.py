@@ -178,7 +178,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
     Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
-    roll [rad], pitch [rad], vertical acceleration [m/s2], `valid` (N, 1) bool; with a memory also `next_memory` (N, m).
+    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory `next_memory` (N, m); `valid` (N, 1) bool.
     A row is not valid, and its action and command are zeros, if its observation is none (not finite, or an absolute sum
     of 1e6 or more): `next_memory` is then `memory`, or at a start one that saw zeros; or if its memory or the answer is
     not finite: `next_memory` is then that of a start. Other rows are as without it. A policy that is told its team is
@@ -198,9 +198,9 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     finite = _is_below(float(np.finfo(np.float32).max), *([memory, following] if around.size else []), action, command)
     valid = sound.binary("And", sound, finite)
     results = {label: _where(valid, value, np.zeros(1)) for label, value in (("action", action), ("command", command))}
-    results["valid"] = valid
     if around.size:
         results["next_memory"] = _where(finite, _where(sound, following, memory), begun)
+    results["valid"] = valid
     for label, value in results.items():
         graph.nodes.append(helper.make_node("Identity", [value.name], [label], name=label))
     kinds = {"valid": TensorProto.BOOL}
@@ -217,7 +217,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 def _is_below(limit: float, *parts: TracedArray) -> TracedArray:
     """Whether a row's absolute sum is below `limit` (N, 1); of NaN and infinity it is not."""
     size = Namespace.concat(parts, -1).unary("Abs")
-    total = TracedArray(size.graph, size.graph.add("ReduceSum", size, np.array([-1], np.int64), keepdims=1), 1)
+    total = size @ np.ones((size.sizes[-1], 1))  # runtimes have no ReduceSum of no flights
     return total.binary("Less", total, np.array([limit]))
 
 

@@ -147,7 +147,7 @@ def test_why_a_flight_ended_is_what_laptop_and_apps_act_on():
     twin = world(seconds=30.0)
     twin.fly_until(Laptop.FLY)
     twin.fly_for(1.0)
-    twin.drones[1].inject(FAULT_KINDS["peer"])
+    twin.drones[1].inject(FAULT_KINDS["peer"].what)
     twin.run()
     told = " ".join(twin.flight.how_it_ended())
     assert "the other drone is not heard" in told

@@ -393,7 +393,7 @@ def test_row_a_dead_stabilizer_logs_on_with_frozen_values() -> None:
 
 def test_rows_of_faults_end_with_motors_off() -> None:
     for kind in ("stopped", "killed", "imu", "stabilizer"):
-        what = FAULT_KINDS[kind]
+        what = FAULT_KINDS[kind].what
         assert isinstance(what, DroneFaults)
         bench = Bench().fly()
         hung = what.stopped or what.stabilizer_dead
@@ -406,8 +406,8 @@ def test_rows_of_faults_end_with_motors_off() -> None:
         assert offs[0] - begun == pytest.approx(0.35, abs=0.02)
         assert bench.firmware.dead == (kind == "killed")
     for kind in ("pose-frozen", "pose-lost", "pose-jump", "sag", "weak"):
-        assert isinstance(FAULT_KINDS[kind], BodyFault)
-    assert FAULT_KINDS["loss"] == LinkFaults(loss=0.3)
+        assert isinstance(FAULT_KINDS[kind].what, BodyFault)
+    assert FAULT_KINDS["loss"].what == LinkFaults(loss=0.3)
 
 
 # Row: tables.
