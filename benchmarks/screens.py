@@ -36,7 +36,7 @@ LONGEST = 600.0  # [s] that a program may take
 VARIABLES = {**environment(), "PYTHONPATH": str(ROOT)}
 TEXT: dict[str, Any] = {"env": VARIABLES, "text": True, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
 ENGINE = ("--physics", "newton-euler")
-FLY = ("-m", "mjxball.fly", "flight", "--rehearse", "--seconds", "2")
+FLY = ("-m", "mjxfly", "flight", "--rehearse", "--seconds", "2")
 FAULT = ("--fault", "silent:leader@4")
 TRAIN = ("train.py", "paper", *ENGINE, "--sac.total_steps", "12000", "--sac.warmup_steps", "2000")
 TRAIN = (*TRAIN, "--sac.replay_size", "12000", "--out", "run")
@@ -44,7 +44,7 @@ VIEW, FLOWN = ("-m", "mjxball.view"), ("--omega", "0.62", "--amplitude", "0.1", 
 PROGRAMS = {  # name: arguments of Python, in a folder of its own
     "train-help": ("train.py", "balance", "--help"),
     "eval-help": ("eval.py", "--help"),
-    "fly-help": ("-m", "mjxball.fly", "--help"),
+    "fly-help": ("-m", "mjxfly", "--help"),
     "view-help": (*VIEW, "--help"),
     "train": TRAIN,
     "eval": ("eval.py", "balance", *ENGINE, "--seconds", "10"),

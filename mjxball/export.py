@@ -92,7 +92,7 @@ def export(
 
     untold = out.suffix == ".npz" and not crazyflie and plant is None and drone is None
     if crazyflie:
-        from mjxball.fly.app.generate import check_place, write_app
+        from mjxfly.app.generate import check_place, write_app
 
         check_place(out)
         if plant is None and team.is_for_any(contents_of(source).card):
@@ -112,7 +112,7 @@ def export(
 
 def export_log(log: Path, out: Path) -> list[str]:
     """Export the flight log `log` to the new file `out`; returns what a reader should know. Raises InputError."""
-    from mjxball.fly.log_export import WRITERS as OF_LOGS
+    from mjxfly.log_export import WRITERS as OF_LOGS
 
     if out.suffix not in OF_LOGS:
         raise InputError(
@@ -137,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        from mjxball.fly.log_import import is_recording
+        from mjxfly.log_import import is_recording
 
         if options.source.suffix == ".jsonl" or is_recording(options.source):
             if options.crazyflie or options.int8 or options.plant or options.drone is not None:

@@ -29,10 +29,10 @@ from recording_bombs import BOMBS
 from mjxball import cli, export
 from mjxball import config as configs
 from mjxball.commands import evaluate, train
-from mjxball.fly import main as fly
 from mjxball.policy.file import shipped_policy
-from mjxball.rig import design, gains, identify
 from mjxball.view import main as view
+from mjxfly import main as fly
+from mjxfly.rig import design, gains, identify
 
 SECONDS, MEMORY = 20.0, 3.0e9  # [s] of a line, [bytes] resident, at most
 POLL = 0.05  # [s]

@@ -55,8 +55,8 @@ class Refuse:
         if name.partition(".")[0] in ("jax", "jaxlib", "flax", "brax", "optax"):
             raise ModuleNotFoundError(f"{name} is refused")
 sys.meta_path.insert(0, Refuse())
-import mjxball.fly, mjxball.rig
-parts = mjxball.fly, mjxball.rig
+import mjxfly, mjxfly.rig
+parts = mjxfly, mjxfly.rig
 names = [one.name for part in parts for one in pkgutil.walk_packages(part.__path__, part.__name__ + ".")]
 for name in names:
     if not name.endswith("__main__"):

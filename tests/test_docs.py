@@ -36,12 +36,12 @@ MAINS = {
     "eval.py": "mjxball.commands.evaluate",
     "mjxball-eval": "mjxball.commands.evaluate",
     "mjxball-view": "mjxball.view.main",
-    "mjxball-fly": "mjxball.fly.main",
+    "mjxball-fly": "mjxfly.main",
     "mjxball.export": "mjxball.export",
     "mjxball.view": "mjxball.view.main",
-    "mjxball.fly": "mjxball.fly.main",
+    "mjxfly": "mjxfly.main",
     "mjxball.assembly": "mjxball.assembly",
-    "mjxball.rig.design": "mjxball.rig.design",
+    "mjxfly.rig.design": "mjxfly.rig.design",
 }
 
 
@@ -224,8 +224,8 @@ def test_commands_parse(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_reader_of_commands() -> None:
     block = "python train.py paper --seed 3  # why\n.venv/bin/python eval.py \\\n --list\nls"
-    text = f"```bash\n{block}\n```\n`python -m mjxball.fly\nx.npz`, `python -m mjxball.fly`"
-    assert list(shown(text)) == [["train.py", "paper", "--seed", "3"], ["eval.py", "--list"], ["mjxball.fly", "x.npz"]]
+    text = f"```bash\n{block}\n```\n`python -m mjxfly\nx.npz`, `python -m mjxfly`"
+    assert list(shown(text)) == [["train.py", "paper", "--seed", "3"], ["eval.py", "--list"], ["mjxfly", "x.npz"]]
 
 
 def test_a_flag_that_does_not_exist_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -218,7 +218,7 @@ def test_what_flies_loads_no_jax(modules: dict[str, Module]) -> None:
 def test_the_flight_path_loads_no_jax_in_truth() -> None:
     """The same of the running interpreter: a dynamic import would escape the syntax tree."""
     script = (
-        "import sys, mjxball.policy, mjxball.control.followers, mjxball.cli, mjxball.entry, mjxball.fly.main\n"
+        "import sys, mjxball.policy, mjxball.control.followers, mjxball.cli, mjxball.entry, mjxfly.main\n"
         "print([name for name in ('jax', 'mujoco', 'scipy', 'matplotlib') if name in sys.modules])"
     )
     done = subprocess.run(

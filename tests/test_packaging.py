@@ -22,10 +22,10 @@ from mjxball import __version__
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.commands.train import parser as train_parser
 from mjxball.export import main as export
-from mjxball.fly.main import make_parser as fly_parser
 from mjxball.policy import Policy, policy_path, shipped_policies, shipped_policy
 from mjxball.policy.file import load_file
 from mjxball.view.main import main as view
+from mjxfly.main import make_parser as fly_parser
 
 PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
 FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
@@ -61,7 +61,7 @@ def parts() -> set[str]:
     """What pages are made of, the plants that have a name, and the C of the apps on board."""
     places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "evaluate/templates", "config/plants"))
     paths = [path for place in places for path in place.iterdir()]
-    paths += (path for path in (REPOSITORY / "mjxball/fly/app").iterdir() if path.suffix in (".c", ".h"))
+    paths += (path for path in (REPOSITORY / "mjxfly/app").iterdir() if path.suffix in (".c", ".h"))
     return {str(path.relative_to(REPOSITORY)) for path in paths}
 
 
@@ -77,7 +77,7 @@ def test_the_wheel_holds_every_module_and_policy_and_nothing_else(wheel: Path) -
     modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "mjxball").rglob("*.py")}
     policies = {f"mjxball/{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "policies").rglob("*.npz")}
     assert len(policies) >= 3
-    assert held == modules | policies | parts() | {"mjxball/py.typed", "mjxball/fly/twin/names.csv"}
+    assert held == modules | policies | parts() | {"mjxball/py.typed", "mjxfly/twin/names.csv"}
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) 
     assert done.stdout.split() == [str(expected), str(len(shipped_policies()))]
 
 
-FLIGHT = "python -m mjxball.fly flight --rehearse --seconds 5 --log flight.jsonl"  # of the twin
+FLIGHT = "python -m mjxfly flight --rehearse --seconds 5 --log flight.jsonl"  # of the twin
 # extra -> what it is for, typed one after the other in an empty directory.
 WORKS = {
     "": [

@@ -15,7 +15,6 @@ from pathlib import Path
 from mjxball import cli, config
 from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES
 from mjxball.bench.tracks import TRACKS
-from mjxball.commands.flight_log import evaluate_log
 from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
@@ -38,6 +37,7 @@ from mjxball.policy.file import policy_path, shipped_policies
 from mjxball.sim.scenario import Scenario
 from mjxball.terminal import Status, warn
 from mjxball.train.run_directory import commit, versions
+from mjxfly.log import evaluate_log
 
 # What `--figures` fixes itself.
 NOT_WITH_FIGURES = ("suite", "num_seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)

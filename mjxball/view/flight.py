@@ -23,13 +23,13 @@ from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.files import write_whole
-from mjxball.fly.log_bags import is_bag
-from mjxball.fly.log_import import UNKNOWN
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
 from mjxball.terminal import warn
-from mjxball.view.marks import Mark, marks_of_log, read_marks
+from mjxfly.log_bags import is_bag
+from mjxfly.log_import import UNKNOWN
+from mjxfly.view.marks import Mark, marks_of_log, read_marks
 
 if TYPE_CHECKING:
     from mjxball.sim.rollout import Trajectory
@@ -164,12 +164,12 @@ def _without_hidden(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def read_log(path: Path) -> Flight:
-    """The flight in a log of `mjxball.fly`, from where its motors first turned.
+    """The flight in a log of `mjxfly`, from where its motors first turned.
 
     The CG, the object's mass and the contact forces are not in a log: they are 0 and the plant's mass here, and no page
     shows them.
     """
-    from mjxball.fly.recording import read_recording
+    from mjxfly.recording import read_recording
 
     if path.suffix != ".jsonl" and not is_bag(path):
         raise InputError(

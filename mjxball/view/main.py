@@ -124,7 +124,7 @@ def _video(flights: Sequence[Flight], suffix: str, speed: float) -> bytes:
 
 
 def _follow(options: argparse.Namespace) -> int:
-    from mjxball.view.live import follow
+    from mjxfly.view.live import follow
 
     if len(options.source) > 1:
         raise InputError("--live follows one log")

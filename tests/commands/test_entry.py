@@ -20,9 +20,9 @@ from tables import rows
 from mjxball import __version__
 
 MODULES = (
-    *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxball.rig.gains", "mjxball.rig.identify"),
-    "mjxball.rig.design",
-    *("mjxball.fly", "mjxball.fly.twin", "mjxball.fly.watchdog"),
+    *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxfly.rig.gains", "mjxfly.rig.identify"),
+    "mjxfly.rig.design",
+    *("mjxfly", "mjxfly.twin", "mjxfly.watchdog"),
 )
 COMMANDS = (*MODULES, "train.py", "eval.py")
 
@@ -101,7 +101,7 @@ def test_installed_commands_are_completed_by_their_own_name(
         assert re.search(rf"^complete .* {name}$", capsys.readouterr().out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxball.fly", "--version"), ("eval.py", "--list")])
+@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxfly", "--version"), ("eval.py", "--list")])
 @pytest.mark.parametrize("buffered", [True, False])
 def test_what_cannot_be_printed_is_said(words: tuple[str, ...], buffered: bool) -> None:
     """Nor is a second line said by Python, which tries again as it ends."""

@@ -19,15 +19,15 @@ from mjxball.evaluate import report as report_page
 from mjxball.evaluate import suites
 from mjxball.evaluate.benchmark import run_benchmark
 from mjxball.evaluate.report import write_report
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.physics import make_pair
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.view.flight import flight_from
-from mjxball.view.live import LiveView, Server
-from mjxball.view.live_log import LiveLog
 from mjxball.view.page import flight_page, page_contents
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.supervisor import State
+from mjxfly.twin.physics import make_pair
+from mjxfly.view.live import LiveView, Server
+from mjxfly.view.live_log import LiveLog
 
 # As a file's name, which holds no slash; placeholders are those of our own templates, dollars begin a formula.
 NAME = "<script>document.title='gone'<img src=x onerror=document.title='gone'>{{script}}{{data}} $\\frac{$ &amp;"

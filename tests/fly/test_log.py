@@ -24,16 +24,16 @@ from mjxball.commands import evaluate
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.control.rotations import turned_about_z
 from mjxball.errors import InputError
-from mjxball.fly import packets, recording
-from mjxball.fly.card import mount_angle
-from mjxball.fly.flight_log import STREAMS, Journal, Tail, read
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.log_schema import KINDS, SCHEMA
-from mjxball.fly.packets import DroneState
-from mjxball.fly.recording import SILENCE, load, read_recording
 from mjxball.policy import Policy
-from mjxball.rig import identify
 from mjxball.view.main import main as view
+from mjxfly import packets, recording
+from mjxfly.card import mount_angle
+from mjxfly.flight_log import STREAMS, Journal, Tail, read
+from mjxfly.limits import FlightSettings
+from mjxfly.log_schema import KINDS, SCHEMA
+from mjxfly.packets import DroneState
+from mjxfly.recording import SILENCE, load, read_recording
+from mjxfly.rig import identify
 
 PRESET = configs.preset("flight")
 HEADER = {"policy": "nobody", "config": configs.to_dict(PRESET), "gains": gains_to_json(pair_gains(PRESET.autopilot))}
@@ -337,7 +337,7 @@ def test_without_a_file_nothing_is_kept() -> None:
 SCRIPT = """
 import json, sys, time
 from pathlib import Path
-from mjxball.fly.flight_log import Journal
+from mjxfly.flight_log import Journal
 log = Journal(Path(sys.argv[1]), policy="nobody", config=json.loads(sys.argv[2]), gains={})
 number = 0
 while True:

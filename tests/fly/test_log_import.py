@@ -21,14 +21,14 @@ from mjxball.commands import evaluate
 from mjxball.control.rotations import matrix_from_quaternion, quaternion_from_euler
 from mjxball.errors import InputError
 from mjxball.export import main as export
-from mjxball.fly import flight_log
-from mjxball.fly.log_import import is_recording
-from mjxball.fly.log_schema import Record, StatePacket
-from mjxball.fly.packets import DroneState
-from mjxball.fly.recording import Recording, numbers, read_recording
 from mjxball.plotting import pyplot
-from mjxball.rig import identify
-from mjxball.rig.log import read_log
+from mjxfly import flight_log
+from mjxfly.log_import import is_recording
+from mjxfly.log_schema import Record, StatePacket
+from mjxfly.packets import DroneState
+from mjxfly.recording import Recording, numbers, read_recording
+from mjxfly.rig import identify
+from mjxfly.rig.log import read_log
 
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap_ros2")

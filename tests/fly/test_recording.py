@@ -15,17 +15,17 @@ from fly_virtual import VirtualTwin, log_header
 from mjxball import config as configs
 from mjxball.commands import evaluate
 from mjxball.control import rotations
-from mjxball.fly import card
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.recording import Recording, _tick_remarks, fly_again, read_recording
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.physics import make_pair
 from mjxball.policy import Policy, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 from mjxball.view.main import main as view
+from mjxfly import card
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.recording import Recording, _tick_remarks, fly_again, read_recording
+from mjxfly.supervisor import State
+from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
+from mjxfly.twin.physics import make_pair
 
 OLDER = drone_kind(curve="older")  # the motors of the preset
 EXACT = Surroundings(exact=True)  # neither the simulation nor `fly_again` has an estimator

@@ -7,7 +7,7 @@ from collections import deque
 
 from tables import rows
 
-from mjxball.fly.supervisor import (
+from mjxfly.supervisor import (
     AIRBORNE,
     ENDED,
     FAULTS,

@@ -24,18 +24,18 @@ from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
 from mjxball.errors import InputError
-from mjxball.fly.display import live_view
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.main import main as fly
-from mjxball.fly.recording import read_recording
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.physics import make_pair
 from mjxball.view.flight import flight_from
-from mjxball.view.live import LiveView, Server
-from mjxball.view.live_log import COLUMNS, STEP, LiveLog, columns
 from mjxball.view.main import main
 from mjxball.view.page import flight_page
+from mjxfly.display import live_view
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.main import main as fly
+from mjxfly.recording import read_recording
+from mjxfly.supervisor import State
+from mjxfly.twin.physics import make_pair
+from mjxfly.view.live import LiveView, Server
+from mjxfly.view.live_log import COLUMNS, STEP, LiveLog, columns
 
 LIMIT = 20.0  # [s] that anything may take here on a busy machine
 

@@ -15,11 +15,11 @@ from conftest import opened
 
 from mjxball.config import Plant
 from mjxball.errors import InputError
-from mjxball.fly.card import config_of
 from mjxball.policy import load_file, shipped_policy
 from mjxball.view.flight import Flight, check_flight, flight_from, load_flight, save_flight, shapes
 from mjxball.view.main import main
 from mjxball.view.page import flight_page, page_contents, plant_of
+from mjxfly.card import config_of
 
 SECONDS = 4.0
 

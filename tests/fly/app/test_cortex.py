@@ -16,10 +16,10 @@ from onboard_bench import Bench, cores_of, needs_gcc, policy_of
 import onboard as benchmark
 from mjxball.control import rotations
 from mjxball.export import main as export
-from mjxball.fly.app import generate, protocol
-from mjxball.fly.app.protocol import Phase
-from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy.file import load_file, save_file, shipped_policy
+from mjxfly.app import generate, protocol
+from mjxfly.app.protocol import Phase
+from mjxfly.telemetry import ObjectState, Rig
 
 needs_arm = pytest.mark.skipif(bool(benchmark.missing()), reason=f"not installed: {benchmark.missing()}")
 

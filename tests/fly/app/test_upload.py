@@ -15,19 +15,19 @@ from onboard_bench import Bench, needs_gcc, policy_of
 import onboard as benchmark
 from mjxball.errors import InputError
 from mjxball.export import main as export
-from mjxball.fly.app import generate, protocol
-from mjxball.fly.app.host import App, compile_pair
-from mjxball.fly.app.protocol import CAUSES, Phase
-from mjxball.fly.app_flight import Apps, send_weights
-from mjxball.fly.connection import LinkError
-from mjxball.fly.limits import NAMES
-from mjxball.fly.main import main as fly
-from mjxball.fly.packets import Packet
-from mjxball.fly.telemetry import Rig
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.policy.quantize import balanced, quantized
+from mjxfly.app import generate, protocol
+from mjxfly.app.host import App, compile_pair
+from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app_flight import Apps, send_weights
+from mjxfly.connection import LinkError
+from mjxfly.limits import NAMES
+from mjxfly.main import main as fly
+from mjxfly.packets import Packet
+from mjxfly.telemetry import Rig
 
 
 def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):

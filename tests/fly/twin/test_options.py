@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from mjxball.errors import InputError
-from mjxball.fly.main import check_twin_options, make_parser, twin_options
-from mjxball.fly.twin.conditions import (
+from mjxfly.main import check_twin_options, make_parser, twin_options
+from mjxfly.twin.conditions import (
     CURVES,
     DRONES,
     OLDER_FORCE,
