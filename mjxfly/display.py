@@ -148,7 +148,7 @@ class Display:
 
 
 def live_view(log: Path, port: int = 0, foxglove: int | None = None) -> Child:
-    """A running `python -m mjxball.view --live` of the flight log `log`, whose `line` says where its page is.
+    """A running `python -m mjxfly.view --live` of the flight log `log`, whose `line` says where its page is.
 
     `foxglove` is the port of that for Foxglove, if there is to be one.
 
@@ -157,7 +157,7 @@ def live_view(log: Path, port: int = 0, foxglove: int | None = None) -> Child:
     more = [] if foxglove is None else ["--foxglove", str(foxglove)]
     flags = ["--live", "--attached", "--port", str(port), *more, "--", str(log)]
     also = " and of --foxglove" if more else ""
-    return Child(["mjxball.view", *flags], f"the live view did not start; is the port of --view{also} free?")
+    return Child(["mjxfly.view", *flags], f"the live view did not start; is the port of --view{also} free?")
 
 
 KILL_KEYS = b" kK"  # the largest key, found without looking

@@ -1,8 +1,14 @@
-"""`eval.py --flight LOG`: a recorded flight beside the simulation of the same commands, figures and numbers."""
+"""What was flown, `python -m mjxfly.log LOG OUT`: figures and numbers, or a file for other programs.
+
+LOG is a flight log (.jsonl), a bag or cfclient's folder. OUT ends in .mcap (ROS 2 messages; of .jsonl alone), .csv or
+.parquet; or it is a new directory, for figures of the flight beside the simulation of the same commands.
+"""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +19,11 @@ from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
 from mjxball.evaluate.plots import PANELS, draw_flights
 from mjxball.evaluate.results import Result, scenario_title
-from mjxball.plotting import SIMULATED, file_format, style
+from mjxball.plotting import SIMULATED, STYLES, file_format, style
 from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
 from mjxball.terminal import warn
+from mjxfly.log_export import WRITERS
 from mjxfly.log_import import UNKNOWN
 from mjxfly.recording import Recording, fly_again, read_recording
 from mjxfly.twin.conditions import Conditions
@@ -24,6 +31,35 @@ from mjxfly.twin.conditions import Conditions
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
 DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
 ASSUMED = tuple((kind, index, f"assumed {text}" if kind == "cg_offset" else text) for kind, index, text in PANELS)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw or export a log; return the exit code."""
+    about, formats = (__doc__ or "").split("\n\n")
+    parser = cli.make_parser("python -m mjxfly.log", about, epilog=formats)
+    parser.add_argument("log", type=Path, metavar="LOG", help="flight log, bag, or folder of cfclient's logs")
+    parser.add_argument("out", type=Path, metavar="OUT", help="new file, whose ending says what, or new directory")
+    about = "figures of a bag: shipped plant, or file of the rig that flew"
+    parser.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
+    about = "of figures: screen (default), or paper: PDF of a column's width"
+    parser.add_argument("--style", choices=STYLES, default="screen", help=about)
+    options = parser.parse_args(arguments)
+    return cli.run_command(lambda: _draw_or_export(options))
+
+
+def _draw_or_export(options: argparse.Namespace) -> int:
+    out, kind = options.out, options.out.suffix
+    if not kind:
+        return evaluate_log(options.log, out, options.style, options.plant)
+    if kind not in WRITERS:
+        endings = ", ".join(WRITERS)
+        raise InputError(f"output {out} must end in {endings}, which chooses the format, or in none: a directory")
+    if options.plant or options.style != "screen":
+        raise InputError(f"--plant and --style belong to figures, and {out} is a file")
+    for remark in WRITERS[kind](cli.output_file(out, kind), options.log):
+        warn(f"note: {remark}")
+    print(out)  # noqa: T201
+    return 0
 
 
 def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None) -> int:
@@ -132,3 +168,8 @@ def _cut(result: Result, rows: int) -> Result:
         parts[name] = np.array(getattr(flight, name), float)
         parts[name][rows:] = np.nan
     return dataclasses.replace(result, flight=dataclasses.replace(flight, **parts))
+
+
+if __name__ == "__main__":
+    cli.quit_on_interrupt()
+    sys.exit(main())

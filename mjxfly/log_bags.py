@@ -34,7 +34,7 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
     try:
         from rosbags.highlevel import AnyReader
     except ModuleNotFoundError:
-        raise InputError("reading a bag needs rosbags; pip install 'mjxball[logs]'") from None
+        raise InputError("reading a bag needs rosbags; pip install 'mjxball[fly]'") from None
     from rosbags.typesys import Stores, get_typestore
 
     found = _files(path)

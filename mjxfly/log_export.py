@@ -174,7 +174,7 @@ def write_parquet(path: Path, log: Path) -> list[str]:
         import pyarrow
         import pyarrow.parquet
     except ModuleNotFoundError:
-        raise InputError("Parquet needs pyarrow; pip install 'mjxball[logs]'") from None
+        raise InputError("Parquet needs pyarrow; pip install 'mjxball[fly]'") from None
     columns, remarks = table(log)
     stream = io.BytesIO()
     pyarrow.parquet.write_table(pyarrow.table(columns), stream)

@@ -230,11 +230,11 @@ def check_log(log: Path, viewed: bool) -> None:
     if log.exists():
         raise InputError(f"log file {log} exists; choose another name")
     if log.suffix not in (".jsonl", ".mcap"):
-        raise InputError(f"log file {log} must end in .jsonl or .mcap; mjxball.export makes other formats of it")
+        raise InputError(f"log file {log} must end in .jsonl or .mcap; mjxfly.log makes other formats of it")
     if not log.absolute().parent.is_dir():
         raise InputError(f"the directory of log file {log} does not exist")
     if log.suffix == ".mcap" and importlib.util.find_spec("mcap_ros2") is None:
-        raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'")
+        raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[fly]'")
     if log.suffix == ".mcap" and viewed:
         raise InputError("--view follows a log of JSON lines: --log FILE.jsonl")
 

@@ -107,7 +107,7 @@ class Encoder:
         try:
             from mcap_ros2.writer import Writer
         except ModuleNotFoundError:
-            raise InputError("messages of ROS 2 need mcap-ros2-support; pip install 'mjxball[logs]'") from None
+            raise InputError("messages of ROS 2 need mcap-ros2-support; pip install 'mjxball[fly]'") from None
         self._writer = Writer(io.BytesIO())
         self._writer._writer = sink  # its own is none that can be given
         self._schemas: dict[str, Any] = {}

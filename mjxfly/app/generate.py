@@ -205,7 +205,7 @@ obj-y += core.o glue.o
 README = """\
 # {name} on board
 
-Made by `python -m mjxball.export POLICY DIR --crazyflie` (configuration {hash}, {weights} weights, {flash} bytes of
+Made by `python -m mjxfly.app POLICY DIR` (configuration {hash}, {weights} weights, {flash} bytes of
 constants, a law every {period} ms, number {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`

@@ -38,7 +38,7 @@ class Foxglove:
         try:
             from websockets.sync.server import serve
         except ModuleNotFoundError:
-            raise InputError("--foxglove needs websockets; pip install 'mjxball[foxglove]'") from None
+            raise InputError("--foxglove needs websockets; pip install 'mjxball[fly]'") from None
         self._encoder = Encoder(self)
         self._lock = threading.Lock()
         self._schemas: list[dict[str, str]] = []

@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from mjxball.errors import InputError
-from mjxball.view.page import live_page, packed
+from mjxball.view.page import packed, page_of
 from mjxfly.view.foxglove import Foxglove
 from mjxfly.view.live_log import LiveLog, columns
 
@@ -30,6 +30,11 @@ BATCH = 20_000  # rows in an answer
 PATIENCE = 10.0  # [s] with a browser that does not go on
 # The page runs its own script, asks its own server, and nothing else.
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; connect-src 'self'"
+
+
+def live_page(title: str, token: str) -> str:
+    """The page that asks its server for a flight while it is flown; `token` names the server."""
+    return page_of(title, {"token": token}, Path(__file__).with_name("live.js"))
 
 
 class LiveView:

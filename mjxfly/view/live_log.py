@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control import rotations
+from mjxball.view.flight import Mark
 from mjxball.view.page import plant_of
 from mjxfly import packets
 from mjxfly.card import variants
@@ -19,7 +20,7 @@ from mjxfly.packets import DroneState
 from mjxfly.recording import LONGEST, FirmwareSetup
 from mjxfly.supervisor import State
 from mjxfly.telemetry import Rig, object_state
-from mjxfly.view.marks import FlightStatus, Mark, placed
+from mjxfly.view.marks import FlightStatus, placed
 
 # A row, in this order: name and number of values, in SI units.
 COLUMNS = {

@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mjxball.reading import parse_json
+from mjxball.view.flight import Mark
 from mjxfly.flight_log import LONGEST_LINE, read
 from mjxfly.log_import import is_foreign
 from mjxfly.log_schema import Record, decode
@@ -18,18 +19,7 @@ BAD = {State.HOLD.value, State.DESCEND.value, State.KILL.value}
 OVER = {State.STOP.value, State.DONE.value}  # as good or bad as what came before
 SEVERITY = {state.value: state.severity for state in State}
 FAULT_NAMES = {event.name for event in FAULTS}
-KINDS = ("phase", "fault", "end")
-LEVELS = ("", "good", "bad")
 STREAMS = (b'"kind": "state"', b'"kind": "health"', b'"kind": "pose"')  # nearly all of a log, and no marks
-
-
-class Mark(NamedTuple):
-    """Something on the time axis: a phase, which lasts until the next one, a fault, or the end."""
-
-    time: float  # [s]
-    kind: str
-    text: str
-    level: str
 
 
 class FlightStatus:
@@ -141,11 +131,3 @@ def _decoded(line: bytes) -> Record | None:
         return decode(raw)
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-
-
-def read_marks(values: Any) -> tuple[Mark, ...]:
-    """Marks as a flight file has them. Raises ValueError or TypeError if they are none."""
-    marks = tuple(Mark(float(t), str(kind), str(text)[:500], str(level)) for t, kind, text, level in values[:1000])
-    if any(mark.kind not in KINDS or mark.level not in LEVELS or not abs(mark.time) < 1e9 for mark in marks):
-        raise ValueError
-    return marks
