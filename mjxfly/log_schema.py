@@ -212,7 +212,7 @@ KINDS: dict[str, Kind] = {
         cause=may(TEXT, "what ended the flight, if not its plan"),
         told=may(TEXTS, "why it ended and how the pair came down, a sentence each"),
         timing=may(JSON, "the loop's: ticks, missed deadlines, lateness (median, p99, largest) [s]"),
-        flown=may(JSON, "figures of the flight under both laws, see `fly.figures`"),
+        flown=may(JSON, "figures of the flight under both laws, see `mjxfly.figures`"),
         overwritten=may(array(None), "setpoints of each link that a newer one replaced"),
     ),
 }  # fmt: skip

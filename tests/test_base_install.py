@@ -1,4 +1,4 @@
-"""A policy flies with the base install alone: NumPy, no JAX, no MuJoCo; `fly/` and `rig/` never load JAX."""
+"""A policy flies with the base install alone: NumPy, no JAX, no MuJoCo; `mjxfly` never loads JAX."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from command_line import REPOSITORY, TRANSPORT, environment
 
 from mjxball.policy import Policy
 
-PARTS = ("mjxball", "pyproject.toml", "README.md", "LICENSE")
+PARTS = ("mjxball", "mjxfly", "pyproject.toml", "README.md", "LICENSE")
 HEAVY = ("jax", "jaxlib", "flax", "brax", "mujoco", "matplotlib")
 SCRIPT = f"""
 import importlib.util, json, sys
@@ -55,9 +55,8 @@ class Refuse:
         if name.partition(".")[0] in ("jax", "jaxlib", "flax", "brax", "optax"):
             raise ModuleNotFoundError(f"{name} is refused")
 sys.meta_path.insert(0, Refuse())
-import mjxfly, mjxfly.rig
-parts = mjxfly, mjxfly.rig
-names = [one.name for part in parts for one in pkgutil.walk_packages(part.__path__, part.__name__ + ".")]
+import mjxfly
+names = [one.name for one in pkgutil.walk_packages(mjxfly.__path__, "mjxfly.")]
 for name in names:
     if not name.endswith("__main__"):
         importlib.import_module(name)
@@ -66,7 +65,7 @@ print(len(names))
 
 
 def test_what_flies_and_identifies_is_imported_where_jax_is_not() -> None:
-    """Every module of both; tests/test_imports.py holds what their functions import."""
+    """Every module of mjxfly; tests/test_imports.py holds what their functions import."""
     done = subprocess.run(
         [sys.executable, "-c", NO_JAX],
         check=True,

@@ -36,10 +36,12 @@ MAINS = {
     "eval.py": "mjxball.commands.evaluate",
     "mjxball-eval": "mjxball.commands.evaluate",
     "mjxball-view": "mjxball.view.main",
-    "mjxball-fly": "mjxfly.main",
     "mjxball.export": "mjxball.export",
     "mjxball.view": "mjxball.view.main",
     "mjxfly": "mjxfly.main",
+    "mjxfly.app": "mjxfly.app.__main__",
+    "mjxfly.log": "mjxfly.log",
+    "mjxfly.view": "mjxfly.view.main",
     "mjxball.assembly": "mjxball.assembly",
     "mjxfly.rig.design": "mjxfly.rig.design",
 }
@@ -181,7 +183,7 @@ def shown(text: str) -> Iterator[list[str]]:
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose)]
     for line in lines:
-        if match := re.search(r"(?:^|\s|/)(?:python3? (?:-m )?|(?=mjxball-[a-z]+(?:\s|$)))(\S+(?:\s.*)?)$", line):
+        if match := re.search(r"(?:^|\s|/)(?:python3? (?:-m )?|(?=mjx[a-z]+-[a-z]+(?:\s|$)))(\S+(?:\s.*)?)$", line):
             words = shlex.split(match[1], comments=True)
             if len(words) > 1 and (words[0] in MAINS or words[0].startswith("benchmarks/")):
                 yield words

@@ -57,7 +57,7 @@ GROUND = {
 BASE = ("arrays", "errors", "reading", "pictures", "files", "config", "cli", "plant", "control", "policy", "entry")
 OURS, FLIES = "mjxball", "mjxfly"
 # What only flights need, their logs and their cameras.
-FLYING = {"cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets", "motioncapture"}
+FLYING = {"cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"}
 
 
 class Module(NamedTuple):

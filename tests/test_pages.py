@@ -29,13 +29,13 @@ from mjxball.sim import disturbances
 from mjxball.sim.rigs import HELD_OUT_RIGS
 from mjxball.train import lock, loop
 from mjxball.train.program import EVALUATION_SECONDS
-from mjxball.view import live
 from mjxfly import card, measured, monitor, positioning, preflight, probe, setpoints, takeoff, uri, watchdog
 from mjxfly.app import protocol
 from mjxfly.limits import Limits, Times
 from mjxfly.mocap_supervision import MocapLimits
 from mjxfly.twin.conditions import Battery
 from mjxfly.twin.coupled import WORN_SAG
+from mjxfly.view import live
 
 DEG = 180 / math.pi
 PAIR, OLDER, UPGRADE, BRUSHLESS = (

@@ -20,9 +20,9 @@ from tables import rows
 from mjxball import __version__
 
 MODULES = (
-    *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxfly.rig.gains", "mjxfly.rig.identify"),
-    "mjxfly.rig.design",
-    *("mjxfly", "mjxfly.twin", "mjxfly.watchdog"),
+    *("mjxball.export", "mjxball.assembly", "mjxball.view"),
+    *("mjxfly", "mjxfly.twin", "mjxfly.watchdog", "mjxfly.view", "mjxfly.log", "mjxfly.app"),
+    *("mjxfly.rig.design", "mjxfly.rig.gains", "mjxfly.rig.identify"),
 )
 COMMANDS = (*MODULES, "train.py", "eval.py")
 
@@ -90,7 +90,7 @@ def test_installed_commands_are_completed_by_their_own_name(
 ) -> None:
     pytest.importorskip("shtab")
     installed = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
-    assert {f"mjxball-{name}" for name in ("train", "eval", "view", "fly", "export")} <= set(installed)
+    assert {f"mjxball-{name}" for name in ("train", "eval", "view", "export")} | {"mjxfly"} <= set(installed)
     for name, place in installed.items():
         monkeypatch.setattr(sys, "argv", [f"/bin/{name}", "--print-completion", "bash"])
         handler = signal.getsignal(signal.SIGINT)

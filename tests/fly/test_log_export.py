@@ -16,9 +16,9 @@ import pytest
 from command_line import REPOSITORY, assert_one_line, call, environment
 from fly_virtual import short_log
 
-from mjxball.export import main
 from mjxfly.flight_log import Journal, read
 from mjxfly.limits import NAMES
+from mjxfly.log import main
 from mjxfly.messages import TYPES
 from mjxfly.recording import Recording, read_recording
 
@@ -197,7 +197,6 @@ def test_refusals(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     cases = [
         ([log, tmp_path / "flight.bag"], "must end in .mcap, .csv, .parquet"),
         ([log, tmp_path / "there.csv"], "exists"),
-        ([log, tmp_path / "new.csv", "--int8"], "takes no other flag"),
         ([tmp_path / "noise.jsonl", tmp_path / "new.mcap"], "noise.jsonl"),
         ([tmp_path / "none.jsonl", tmp_path / "new.mcap"], "none.jsonl"),
         ([tmp_path / "old.mcap", tmp_path / "new.mcap"], "old.mcap is not converted to .mcap; expected a flight log"),

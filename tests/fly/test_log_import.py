@@ -17,12 +17,11 @@ from command_line import assert_one_line, call
 from fly_virtual import short_log
 from foreign_logs import NAMES, write_bag, write_cfclient
 
-from mjxball.commands import evaluate
 from mjxball.control.rotations import matrix_from_quaternion, quaternion_from_euler
 from mjxball.errors import InputError
-from mjxball.export import main as export
 from mjxball.plotting import pyplot
 from mjxfly import flight_log
+from mjxfly.log import main as export
 from mjxfly.log_import import is_recording
 from mjxfly.log_schema import Record, StatePacket
 from mjxfly.packets import DroneState
@@ -83,10 +82,7 @@ def test_a_bag_of_ours_is_the_log_itself(log: Path, flight: Recording, exported:
 
 @pytest.mark.slow
 def test_its_report_has_the_same_numbers(log: Path, exported: Path, tmp_path: Path, capsys) -> None:
-    reports = [
-        printed(evaluate.main, ["--flight", path, "--out", tmp_path / path.suffix[1:]], capsys)
-        for path in (log, exported)
-    ]
+    reports = [printed(export, [path, tmp_path / path.suffix[1:]], capsys) for path in (log, exported)]
     assert reports[0] == reports[1]
     assert len(reports[0]) > 2
 
@@ -127,7 +123,7 @@ def test_a_figure_has_what_a_recording_has(
         assert "assumed: CG" in figure.legends[0].get_title().get_text()
 
     monkeypatch.setattr(pyplot(), "close", keep)
-    assert call(evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]) == 0
+    assert call(export, [path, tmp_path / "drawn"]) == 0
     monkeypatch.undo()
     pyplot().close("all")
     motion = ["x [m]", "y [m]", "z [m]"]
@@ -516,14 +512,14 @@ def test_bad_input_is_refused_in_one_sentence(
     ]
     for path, reason in cases:
         for main, arguments in (
-            (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+            (export, [path, tmp_path / "drawn"]),
             (identify.main, [path]),
         ):
             assert call(main, arguments) == 2, path
             errors = capsys.readouterr().err
             assert reason in errors, errors
             assert_one_line(errors)
-    assert call(evaluate.main, ["--flight", exported, "--plant", "crazyflie", "--out", tmp_path / "drawn"]) == 2
+    assert call(export, [exported, tmp_path / "drawn", "--plant", "crazyflie"]) == 2
     assert "says which rig flew: drop --plant" in capsys.readouterr().err
     assert not (tmp_path / "drawn").exists()
 
@@ -568,7 +564,7 @@ def test_bags_with_numbers_that_are_none_are_refused(tmp_path: Path, capsys) -> 
 def assert_refused(path: Path, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All that reads a recording says the one sentence `reason`, a regular expression, and writes nothing."""
     for main, arguments in (
-        (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+        (export, [path, tmp_path / "drawn"]),
         (identify.main, [path, "--out", tmp_path / "drawn.json"]),
         (export, [path, tmp_path / "drawn.csv"]),
     ):

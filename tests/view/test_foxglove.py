@@ -15,12 +15,12 @@ from command_line import assert_one_line, call
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
-from mjxball.view.main import main as view
 from mjxfly import flight_log
 from mjxfly.display import live_view
 from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
 from mjxfly.view.foxglove import Foxglove
+from mjxfly.view.main import main as view
 
 client = pytest.importorskip("websockets.sync.client")
 exceptions = pytest.importorskip("websockets.exceptions")

@@ -20,6 +20,7 @@ from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.policy.quantize import balanced, quantized
 from mjxfly.app import generate, protocol
+from mjxfly.app.__main__ import main as make_app
 from mjxfly.app.host import App, compile_pair
 from mjxfly.app.protocol import CAUSES, Phase
 from mjxfly.app_flight import Apps, send_weights
@@ -42,13 +43,13 @@ def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 
 def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.CaptureFixture):
-    for arguments, text in (
-        ([shipped_policy("balance"), tmp_path / "app", "--crazyflie"], "another plant than a pair of Crazyflies"),
-        ([shipped_policy("flight"), tmp_path, "--crazyflie"], "exists"),
-        ([shipped_policy("flight"), tmp_path / "a" / "b", "--crazyflie"], "does not exist"),
-        (["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
+    for main, arguments, text in (
+        (make_app, [shipped_policy("balance"), tmp_path / "app"], "another plant than a pair of Crazyflies"),
+        (make_app, [shipped_policy("flight"), tmp_path], "exists"),
+        (make_app, [shipped_policy("flight"), tmp_path / "a" / "b"], "does not exist"),
+        (export, ["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
     ):
-        assert call(export, arguments) == 2, text
+        assert call(main, arguments) == 2, text
         error = capsys.readouterr().err
         assert_one_line(error)
         assert text in error
