@@ -173,7 +173,7 @@ def make_parser(
     Installed commands (`mjxball-train`) are called by their own name, whatever `program` says. `describe`: see `Help`.
     """
     called = Path(sys.argv[0]).stem
-    name = called if called.startswith("mjxball-") else program
+    name = called if called.startswith("mjx") else program
     given: dict[str, Any] = {"allow_abbrev": False, "formatter_class": Formatter, "add_help": describe is None}
     parser = Parser(prog=name, description=description, usage=usage, epilog=epilog, **given)
     if describe is not None:

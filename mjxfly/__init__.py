@@ -4,5 +4,6 @@ The way of the data: `packets` (bytes <-> SI) -> `link` (one drone over cflib) -
 -> `card` (policy's card, leader PID and follower policy) -> `command` (thrust units) and `monitor` (what is wrong)
 -> `supervisor` (pure table of states) -> `flight` (one tick) -> `session` (threads, clocks, printing) -> `main`.
 `flight_log` and `recording` read a log back; the commands `log` and `view` show it, and `rig` computes gains and
-identifies the rig from it. `app` makes the same laws apps of the firmware. Files, clocks, sockets and printing live at the edges.
+identifies the rig from it. `app` makes the same laws apps of the firmware. Files, clocks, sockets and printing live at
+the edges.
 """

@@ -17,7 +17,7 @@ def log() -> int:
 
 def app() -> int:
     """Run `mjxfly-app`; return its exit code."""
-    return run_module("mjxfly.app.__main__")
+    return run_module("mjxfly.app.main")
 
 
 def design() -> int:

@@ -32,7 +32,7 @@ from mjxball.commands import evaluate, train
 from mjxball.policy.file import shipped_policy
 from mjxfly import log
 from mjxfly import main as fly
-from mjxfly.app import __main__ as app
+from mjxfly.app import main as app
 from mjxfly.rig import design, gains, identify
 from mjxfly.view import main as view
 

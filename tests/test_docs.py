@@ -39,7 +39,7 @@ MAINS = {
     "mjxball.export": "mjxball.export",
     "mjxball.view": "mjxball.view.main",
     "mjxfly": "mjxfly.main",
-    "mjxfly.app": "mjxfly.app.__main__",
+    "mjxfly.app": "mjxfly.app.main",
     "mjxfly.log": "mjxfly.log",
     "mjxfly.view": "mjxfly.view.main",
     "mjxball.assembly": "mjxball.assembly",

@@ -255,7 +255,7 @@ def test_the_flight_path_loads_no_jax_in_truth() -> None:
 
 
 COMMANDS = ("commands.train", "commands.evaluate", "view.main", "export")
-FLIGHT_COMMANDS = ("main", "view.main", "log", "app.__main__")
+FLIGHT_COMMANDS = ("main", "view.main", "log", "app.main")
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import onboard as benchmark
 from mjxball.control import rotations
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxfly.app import generate, protocol
-from mjxfly.app.__main__ import main as make_app
+from mjxfly.app.main import main as make_app
 from mjxfly.app.protocol import Phase
 from mjxfly.telemetry import ObjectState, Rig
 

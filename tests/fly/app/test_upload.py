@@ -20,8 +20,8 @@ from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.policy.quantize import balanced, quantized
 from mjxfly.app import generate, protocol
-from mjxfly.app.__main__ import main as make_app
 from mjxfly.app.host import App, compile_pair
+from mjxfly.app.main import main as make_app
 from mjxfly.app.protocol import CAUSES, Phase
 from mjxfly.app_flight import Apps, send_weights
 from mjxfly.connection import LinkError
