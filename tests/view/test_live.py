@@ -196,6 +196,8 @@ def test_what_is_no_log_is_refused(contents: bytes, message: str, tmp_path: Path
         (["--live", "nowhere/log.jsonl"], "does not exist"),
         (["--live", "log.jsonl", "--port", "70000"], "--port must be"),
         (["--live", "log.jsonl", "--out", "page.html"], "--live writes no file"),
+        (["--live", "log.jsonl", "--video", "out.gif"], "--live writes no file"),
+        (["--live", "log.jsonl", "more.jsonl"], "--live follows one log"),
         (["log.jsonl", "--port", "8000"], "--port is the port of --live"),
         (["--live", "log.jsonl", "--port", "TAKEN"], "cannot be had"),
     ],
