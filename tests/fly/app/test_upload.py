@@ -43,15 +43,15 @@ def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 
 def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.CaptureFixture):
-    universal = shipped_policy("universal")
+    universal, place = shipped_policy("universal"), tmp_path / "app"
     for main, arguments, text in (
-        (make_app, [shipped_policy("balance"), tmp_path / "app"], "another plant than a pair of Crazyflies"),
+        (make_app, [shipped_policy("balance"), place], "another plant than a pair of Crazyflies"),
         (
             make_app,
             [universal, tmp_path / "app", "--plant", "team4"],
             "for pairs of Crazyflies, and team4 has 4 drones",
         ),
-        (make_app, [universal, tmp_path / "app", "--plant", "pair"], "is for another plant than a pair of Crazyflies"),
+        (make_app, [universal, place, "--plant", "pair"], "is for another plant than a pair of Crazyflies"),
         (make_app, [shipped_policy("flight"), tmp_path], "exists"),
         (make_app, [shipped_policy("flight"), tmp_path / "a" / "b"], "does not exist"),
         (export, ["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
