@@ -36,16 +36,6 @@ def is_foreign(path: Path) -> bool:
     return path.is_dir() or path.suffix == ".csv" or is_bag(path)
 
 
-def is_recording(path: Path) -> bool:
-    """Whether `path` is a bag, or a folder that is one or has cfclient's two."""
-    if not path.is_dir():
-        return is_bag(path)
-    if (path / "config.json").exists():
-        return False  # a run of train.py
-    names = ("metadata.yaml", *NAMES)
-    return any((path / name).exists() for name in names) or any(map(is_bag, path.iterdir()))
-
-
 def read(path: Path, remark: Callable[[str], None], assumed: Config | None = None) -> bytes | list[Record]:
     """The lines of a log of ours in the bag `path`, or records made of what another program recorded there.
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 
-from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.terminal import warn
-from mjxball.view.flight import Flight, check_flight
+from mjxball.view.flight import Flight, check_flight, flight_of
+from mjxfly.log import trajectory_of
 from mjxfly.log_bags import is_bag
 from mjxfly.log_import import UNKNOWN
 from mjxfly.recording import read_recording
@@ -31,23 +32,16 @@ def read_log(path: Path) -> Flight:
         raise InputError(f"{path} says no goal that could be shown; mjxfly.log draws it")
     for remark in recording.remarks:
         warn(remark)
-    rows = len(recording.time)
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion))
-    arrays = {
-        "time": recording.time,
-        "position": recording.position,
-        "velocity": recording.velocity,
-        "euler": euler,
-        "quaternion": recording.quaternion,
-        "rotor_force": recording.rotor_force,
-        "leader_command": np.nan_to_num(recording.leader),
-        "follower_command": np.nan_to_num(recording.follower),
-        "cg_offset": np.zeros(rows),
-        "object_mass": np.full(rows, recording.config.plant.object_mass),
-        "contact_force": np.zeros((rows, 2, 3)),
-        "target": recording.target,
-        **({"hidden": np.nan_to_num(recording.hidden)} if recording.hidden.shape[1] else {}),
-    }
+    known = dataclasses.replace(
+        trajectory_of(recording),
+        leader_command=np.nan_to_num(recording.leader),
+        follower_command=np.nan_to_num(recording.follower),
+        cg_offset=np.zeros(rows := len(recording.time)),
+        object_mass=np.full(rows, recording.config.plant.object_mass),
+        contact_force=np.zeros((rows, 2, 3)),
+    )
+    hidden = np.nan_to_num(recording.hidden) if recording.hidden.shape[1] else None
     title = f"{recording.policy}, flown (ball and contact forces were not measured)"
     marks = marks_of_log(path, float(recording.time[-1]))
-    return check_flight(Flight(title, recording.config.plant, arrays, marks), str(path))
+    flight = flight_of(known, recording.config.plant, title, hidden)
+    return check_flight(dataclasses.replace(flight, marks=marks), str(path))

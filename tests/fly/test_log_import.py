@@ -22,7 +22,6 @@ from mjxball.errors import InputError
 from mjxball.plotting import pyplot
 from mjxfly import flight_log
 from mjxfly.log import main as export
-from mjxfly.log_import import is_recording
 from mjxfly.log_schema import Record, StatePacket
 from mjxfly.packets import DroneState
 from mjxfly.recording import Recording, numbers, read_recording
@@ -584,13 +583,6 @@ def test_pipes_and_second_recordings_are_refused(records: list[Record], tmp_path
     first = next((twice / "leader").glob("*.csv"))
     shutil.copy(first, first.with_name("again.csv"))
     assert_refused(twice, "in another file of", tmp_path, capsys)
-
-
-def test_a_run_with_a_bag_in_it_is_a_run(tmp_path: Path) -> None:
-    (tmp_path / "flight.mcap").touch()
-    assert is_recording(tmp_path)
-    (tmp_path / "config.json").touch()
-    assert not is_recording(tmp_path)
 
 
 def moved(record: Record) -> DroneState:

@@ -18,15 +18,7 @@ from mjxball.errors import InputError
 from mjxfly.connection import READ, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxfly.limits import Limits
 from mjxfly.packets import DroneState, Health, Packet, Sensed
-from mjxfly.preflight import (
-    Preflight,
-    check_kind,
-    gravity_checks,
-    heading_check,
-    prepare,
-    reset_estimator,
-    stick_check,
-)
+from mjxfly.preflight import Preflight, check_kind, gravity_checks, heading_check, prepare, reset_estimator, stick_check
 from mjxfly.setpoints import CommandMap, Variant
 from mjxfly.telemetry import HealthSample, Rig, SensedSample
 

@@ -46,11 +46,7 @@ def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.
     universal, place = shipped_policy("universal"), tmp_path / "app"
     for main, arguments, text in (
         (make_app, [shipped_policy("balance"), place], "another plant than a pair of Crazyflies"),
-        (
-            make_app,
-            [universal, tmp_path / "app", "--plant", "team4"],
-            "for pairs of Crazyflies, and team4 has 4 drones",
-        ),
+        (make_app, [universal, place, "--plant", "team4"], "for pairs of Crazyflies, and team4 has 4 drones"),
         (make_app, [universal, place, "--plant", "pair"], "is for another plant than a pair of Crazyflies"),
         (make_app, [shipped_policy("flight"), tmp_path], "exists"),
         (make_app, [shipped_policy("flight"), tmp_path / "a" / "b"], "does not exist"),

@@ -12,14 +12,7 @@ from twin_peer import written
 from mjxball import config as configs
 from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import pair_gains
-from mjxfly.twin.conditions import (
-    DELIVERED,
-    Battery,
-    Conditions,
-    DroneKind,
-    Surroundings,
-    drone_kind,
-)
+from mjxfly.twin.conditions import DELIVERED, Battery, Conditions, DroneKind, Surroundings, drone_kind
 from mjxfly.twin.coupled import CoupledPair
 from mjxfly.twin.drone import TwinDrone
 from mjxfly.twin.estimators import Imu
