@@ -25,8 +25,8 @@ from mjxball.xla import explained
 
 FAULT = 3  # exit code after an error of the program, where 1 is a result
 # Packages that another extra than `train` brings.
-EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly", "yaml": "fly", "osqp": "mpc"}
-EXTRAS |= dict.fromkeys(("mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
+EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "osqp": "mpc"}
+EXTRAS |= dict.fromkeys(("cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
 SHELLS = ("bash", "zsh", "tcsh")
 Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 

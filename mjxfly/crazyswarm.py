@@ -134,10 +134,7 @@ def _choose(path: Path, flying: Sequence[str], asked: Sequence[str | None]) -> t
 
 
 def _parsed(path: Path) -> Any:
-    try:
-        import yaml
-    except ImportError:
-        raise InputError("--crazyflies needs PyYAML; pip install 'mjxball[fly]'") from None
+    import yaml
 
     class Loader(yaml.SafeLoader):
         """YAML that says everything once."""

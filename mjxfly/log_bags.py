@@ -31,10 +31,7 @@ class Found(NamedTuple):
 
 def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
     """The bag `path`, a file or a folder. Raises InputError: it is none, is empty, or its clocks do not agree."""
-    try:
-        from rosbags.highlevel import AnyReader
-    except ModuleNotFoundError:
-        raise InputError("reading a bag needs rosbags; pip install 'mjxball[fly]'") from None
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     found = _files(path)

@@ -170,11 +170,9 @@ def write_csv(path: Path, log: Path) -> list[str]:
 
 def write_parquet(path: Path, log: Path) -> list[str]:
     """Write the flight in `log` as Parquet; numbers that are not there are NaN. Raises InputError."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ModuleNotFoundError:
-        raise InputError("Parquet needs pyarrow; pip install 'mjxball[fly]'") from None
+    import pyarrow
+    import pyarrow.parquet
+
     columns, remarks = table(log)
     stream = io.BytesIO()
     pyarrow.parquet.write_table(pyarrow.table(columns), stream)

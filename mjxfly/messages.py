@@ -100,14 +100,9 @@ class Encoder:
     """Makes messages of the records of a flight log, and gives them to a sink."""
 
     def __init__(self, sink: Any):
-        """`sink` takes schemas, channels and messages as the writer of the package mcap does.
+        """`sink` takes schemas, channels and messages as the writer of the package mcap does."""
+        from mcap_ros2.writer import Writer
 
-        Raises InputError without mcap-ros2-support.
-        """
-        try:
-            from mcap_ros2.writer import Writer
-        except ModuleNotFoundError:
-            raise InputError("messages of ROS 2 need mcap-ros2-support; pip install 'mjxball[fly]'") from None
         self._writer = Writer(io.BytesIO())
         self._writer._writer = sink  # its own is none that can be given
         self._schemas: dict[str, Any] = {}

@@ -236,7 +236,7 @@ def test_the_ground_floor_never_imports_jax_or_mujoco_not_even_lazily(modules: d
 def test_what_flies_loads_no_jax(modules: dict[str, Module]) -> None:
     """Not in a function either, nor through a module that a function imports."""
     for name, module in modules.items():
-        if module.part in ("mjxfly", "mjxfly.rig"):
+        if module.part.startswith(FLIES):
             reached = foreign(module.lazy).union(
                 needs(modules, name), *(needs(modules, one) for one in own(module.lazy))
             )

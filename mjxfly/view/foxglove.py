@@ -35,10 +35,8 @@ class Foxglove:
 
     def __init__(self, port: int):
         """Listen on `port` of the loopback, 0 for a free one. Raises InputError if that cannot be had."""
-        try:
-            from websockets.sync.server import serve
-        except ModuleNotFoundError:
-            raise InputError("--foxglove needs websockets; pip install 'mjxball[fly]'") from None
+        from websockets.sync.server import serve
+
         self._encoder = Encoder(self)
         self._lock = threading.Lock()
         self._schemas: list[dict[str, str]] = []
