@@ -27,15 +27,15 @@ import numpy as np
 
 from harness import Row, arguments, table, write
 from mjxball.cli import run_command
-from mjxball.fly.app.host import Library, compile_pair
-from mjxball.fly.card import Controller, goal_of, limits_of, times_of
-from mjxball.fly.figures import SETTLING
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
+from mjxfly.app.host import Library, compile_pair
+from mjxfly.card import Controller, goal_of, limits_of, times_of
+from mjxfly.figures import SETTLING
+from mjxfly.limits import FlightSettings
+from mjxfly.supervisor import State
+from mjxfly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
+from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
 
 SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
 SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands

@@ -27,11 +27,11 @@ from harness import Row, arguments, say, table, write
 from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.export import in_team
-from mjxball.fly.app.generate import CORE, options, rig_header, sources
-from mjxball.fly.card import config_of
 from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.file import law_of, load_file, shipped_policies, shipped_policy
 from mjxball.policy.formats.c_header import APP, c_header, footprint
+from mjxfly.app.generate import CORE, options, rig_header, sources
+from mjxfly.card import config_of
 
 HOST = ("gcc",)
 ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")

@@ -36,15 +36,15 @@ LONGEST = 600.0  # [s] that a program may take
 VARIABLES = {**environment(), "PYTHONPATH": str(ROOT)}
 TEXT: dict[str, Any] = {"env": VARIABLES, "text": True, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
 ENGINE = ("--physics", "newton-euler")
-FLY = ("-m", "mjxball.fly", "flight", "--rehearse", "--seconds", "2")
+FLY = ("-m", "mjxfly", "flight", "--rehearse", "--seconds", "2")
 FAULT = ("--fault", "silent:leader@4")
 TRAIN = ("train.py", "paper", *ENGINE, "--sac.total_steps", "12000", "--sac.warmup_steps", "2000")
 TRAIN = (*TRAIN, "--sac.replay_size", "12000", "--out", "run")
-VIEW, FLOWN = ("-m", "mjxball.view"), ("--omega", "0.62", "--amplitude", "0.1", "--seconds", "8", *ENGINE, "--out")
+VIEW, FLOWN = ("-m", "mjxfly.view"), ("--omega", "0.62", "--amplitude", "0.1", "--seconds", "8", *ENGINE, "--out")
 PROGRAMS = {  # name: arguments of Python, in a folder of its own
     "train-help": ("train.py", "balance", "--help"),
     "eval-help": ("eval.py", "--help"),
-    "fly-help": ("-m", "mjxball.fly", "--help"),
+    "fly-help": ("-m", "mjxfly", "--help"),
     "view-help": (*VIEW, "--help"),
     "train": TRAIN,
     "eval": ("eval.py", "balance", *ENGINE, "--seconds", "10"),
@@ -82,8 +82,8 @@ SEEN: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
     "log-fault": ((*FLY, *FAULT, "--log", "fault.jsonl"), "", ()),
     "viewer-log": ((*VIEW, "fault.jsonl", "--out", "log.html"), "log.html", ("log-fault",)),
     "live": ((*VIEW, "fault.jsonl", "--live"), SERVER, ("log-fault",)),
-    "flight": (("eval.py", "--flight", "flight.jsonl", "--out", "flown"), "flown/*.png", ("log",)),
-    "paper": (("eval.py", "--flight", "flight.jsonl", "--style", "paper", "--out", "ink"), "ink/*.pdf", ("log",)),
+    "flight": (("-m", "mjxfly.log", "flight.jsonl", "flown"), "flown/*.png", ("log",)),
+    "paper": (("-m", "mjxfly.log", "flight.jsonl", "ink", "--style", "paper"), "ink/*.pdf", ("log",)),
     "report": (("eval.py", "balance", "--followers", "copy", *ENGINE, "--out", "report"), "report/*.[hp][tn]*", ()),
     "figures": (("eval.py", "balance", "--figures", "all", *ENGINE, "--out", "figures"), "figures/*.html", ()),
     "notebook": (("-c", NOTEBOOK, str(ROOT / "docs/notebooks/first_follower.ipynb")), "notebook.html", ()),

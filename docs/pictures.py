@@ -27,15 +27,15 @@ import numpy as np
 from mjxball import Policy, Scenario
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
-from mjxball.commands.flight_log import result_of, without_goal
 from mjxball.control.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
 from mjxball.evaluate.paper_figures import draw_figure
 from mjxball.evaluate.plots import PANELS, draw_flights
 from mjxball.evaluate.results import fly_scenarios, scenario_title
 from mjxball.evaluate.scenarios import REFERENCE
-from mjxball.fly.recording import read_recording
 from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
 from mjxball.policy.file import policy_path, shipped_policy
+from mjxfly.log import result_of, without_goal
+from mjxfly.recording import read_recording
 
 REPOSITORY = Path(__file__).parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

@@ -25,8 +25,8 @@ from mjxball.xla import explained
 
 FAULT = 3  # exit code after an error of the program, where 1 is a result
 # Packages that another extra than `train` brings.
-EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly", "yaml": "fly", "osqp": "mpc", "websockets": "foxglove"}
-EXTRAS |= dict.fromkeys(("mcap", "mcap_ros2", "rosbags", "pyarrow"), "logs")
+EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "osqp": "mpc"}
+EXTRAS |= dict.fromkeys(("cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
 SHELLS = ("bash", "zsh", "tcsh")
 Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 
@@ -173,7 +173,7 @@ def make_parser(
     Installed commands (`mjxball-train`) are called by their own name, whatever `program` says. `describe`: see `Help`.
     """
     called = Path(sys.argv[0]).stem
-    name = called if called.startswith("mjxball-") else program
+    name = called if called.startswith("mjx") else program
     given: dict[str, Any] = {"allow_abbrev": False, "formatter_class": Formatter, "add_help": describe is None}
     parser = Parser(prog=name, description=description, usage=usage, epilog=epilog, **given)
     if describe is not None:
@@ -221,7 +221,7 @@ def run_command(command: Callable[[], int]) -> int:
         warn(f"error: {where}: {error.strerror or error}")
         return 2
     except ModuleNotFoundError as error:
-        if (error.name or "").startswith("mjxball"):
+        if (error.name or "").startswith("mjx"):  # of this distribution
             raise
         extra = EXTRAS.get(error.name or "", "train")
         warn(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'")

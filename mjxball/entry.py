@@ -12,26 +12,26 @@ def train() -> int:
     """Run `train.py`; return its exit code."""
     collect_seldom()
     switch_often()
-    return _run("mjxball.commands.train")  # until training starts there is nothing to save
+    return run_module("mjxball.commands.train")  # until training starts there is nothing to save
 
 
 def evaluate() -> int:
     """Run `eval.py`; return its exit code."""
     collect_seldom()
-    return _run("mjxball.commands.evaluate")
+    return run_module("mjxball.commands.evaluate")
 
 
 def view() -> int:
     """Run `mjxball-view`; return its exit code."""
-    return _run("mjxball.view.main")
+    return run_module("mjxball.view.main")
 
 
 def export() -> int:
     """Run `mjxball-export`; return its exit code."""
-    return _run("mjxball.export")
+    return run_module("mjxball.export")
 
 
-def _run(module: str) -> int:
+def run_module(module: str) -> int:
     """`main` of `module`, which Ctrl-C ends at once: there is nothing to save.
 
     Returns its exit code; `FAULT` after an error of the program's own: 1, which Python would say, is a result.

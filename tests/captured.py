@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.fly import mocap_supervision as supervision
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.mocap import Mocap, MocapSettings
-from mjxball.fly.mocap_supervision import Frame, Pose
-from mjxball.fly.twin.conditions import QUIET
-from mjxball.fly.twin.estimators import product
-from mjxball.fly.twin.positioning import ATTITUDE_NOISE, POSITION_NOISE
-from mjxball.fly.twin.virtual import STEP, VirtualTwin
 from mjxball.policy import Policy
+from mjxfly import mocap_supervision as supervision
+from mjxfly.limits import FlightSettings
+from mjxfly.mocap import Mocap, MocapSettings
+from mjxfly.mocap_supervision import Frame, Pose
+from mjxfly.twin.conditions import QUIET
+from mjxfly.twin.estimators import product
+from mjxfly.twin.positioning import ATTITUDE_NOISE, POSITION_NOISE
+from mjxfly.twin.virtual import STEP, VirtualTwin
 
 EVERY = 2  # steps of the twin between two frames: 100 Hz
 See = Callable[[Frame], Frame]  # what a camera system makes of the true poses

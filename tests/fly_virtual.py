@@ -11,17 +11,17 @@ from fly_policies import untrained
 
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
-from mjxball.fly import card, packets
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.setpoints import CommandMap
-from mjxball.fly.telemetry import Rig
-from mjxball.fly.twin import virtual
-from mjxball.fly.twin.conditions import DELIVERED, DroneKind
-from mjxball.fly.twin.pair import Pair
-from mjxball.fly.twin.physics import StandIn, StandInPlant
-from mjxball.fly.twin.virtual import MemoryLog, VirtualLink
 from mjxball.policy import Policy, PolicyFile
+from mjxfly import card, packets
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.setpoints import CommandMap
+from mjxfly.telemetry import Rig
+from mjxfly.twin import virtual
+from mjxfly.twin.conditions import DELIVERED, DroneKind
+from mjxfly.twin.pair import Pair
+from mjxfly.twin.physics import StandIn, StandInPlant
+from mjxfly.twin.virtual import MemoryLog, VirtualLink
 
 __all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "VirtualTwin", "log_header", "short_log", "thrusts"]
 MASS = 0.07

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.fly.log_schema import Record
+from mjxfly.log_schema import Record
 
 START = 1_700_000_000_000_000_000  # [ns]
 NAMES = {"leader": "cf7", "follower": "cf231"}

@@ -29,10 +29,12 @@ from recording_bombs import BOMBS
 from mjxball import cli, export
 from mjxball import config as configs
 from mjxball.commands import evaluate, train
-from mjxball.fly import main as fly
 from mjxball.policy.file import shipped_policy
-from mjxball.rig import design, gains, identify
-from mjxball.view import main as view
+from mjxfly import log
+from mjxfly import main as fly
+from mjxfly.app import main as app
+from mjxfly.rig import design, gains, identify
+from mjxfly.view import main as view
 
 SECONDS, MEMORY = 20.0, 3.0e9  # [s] of a line, [bytes] resident, at most
 POLL = 0.05  # [s]
@@ -229,7 +231,7 @@ def parser_in(main: Callable[[list[str]], Any]) -> argparse.ArgumentParser:
 
 def programs() -> list[Program]:
     """Every command of the project that a user calls."""
-    module, flight = (lambda name: ("-m", f"mjxball.{name}")), str(shipped_policy("flight"))
+    flies, flight = (lambda name: ("-m", f"mjxfly.{name}")), str(shipped_policy("flight"))
     balance = str(shipped_policy("balance"))
     text = frozenset(
         {"--env", "--reward", "--twin-load", "--mocap-option", "--bodies", "--mocap-host", "--coordinator"}
@@ -239,12 +241,14 @@ def programs() -> list[Program]:
     return [
         Program("train", (str(ROOT / "train.py"),), learning, train.parser(), text),
         Program("eval", (str(ROOT / "eval.py"),), ("--followers", *short), evaluate.parser(), text),
-        Program("view", module("view"), (*short, "--out", "page.html"), view.parser(), text),
-        Program("fly", module("fly"), (flight, "--rehearse", "--seconds", "2"), fly.make_parser(), text),
-        Program("export", module("export"), (balance, "out.npz"), parser_in(export.main), text),
-        Program("gains", module("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
-        Program("design", module("rig.design"), ("--plant", "team3"), design.parser(), text),
-        Program("identify", module("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
+        Program("export", ("-m", "mjxball.export"), (balance, "out.npz"), parser_in(export.main), text),
+        Program("fly", ("-m", "mjxfly"), (flight, "--rehearse", "--seconds", "2"), fly.make_parser(), text),
+        Program("view", flies("view"), (*short, "--out", "page.html"), view.parser(), text),  # mjxball.view and more
+        Program("app", flies("app"), (flight, "app"), parser_in(app.main), text),
+        Program("log", flies("log"), ("flight.jsonl", "out"), parser_in(log.main), text),
+        Program("gains", flies("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
+        Program("design", flies("rig.design"), ("--plant", "team3"), design.parser(), text),
+        Program("identify", flies("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
     ]
 
 
@@ -313,7 +317,7 @@ def _with(program: Program, flaw: str, *flag: str, files: dict[str, Content] | N
     return Case(program.name, flaw, (*program.start, *program.line, *flag), files or {})
 
 
-PLACES = {"train": "run", "eval": "out", "view": "page.html", "export": "out.npz", "gains": "gains.json"}
+PLACES = {"train": "run", "eval": "out", "view": "page.html", "export": "out.npz", "app": "app", "gains": "gains.json"}
 
 
 def files(every: dict[str, Program]) -> Iterator[Case]:
@@ -325,6 +329,7 @@ def files(every: dict[str, Program]) -> Iterator[Case]:
             "view": (bad, "--seconds", "1", "--out", "page.html"),
             "fly": (bad, "--rehearse", "--seconds", "2"),
             "export": (bad, "out.onnx"),
+            "app": (bad, "app"),
             "train": ("balance", "--start-from", bad, "--out", "run"),
         }.items():
             if name in ("eval", "fly") or flaw in ODD_FILES or flaw == "a twice given key":
@@ -339,7 +344,7 @@ def files(every: dict[str, Program]) -> Iterator[Case]:
     for flaw, content in {**ODD_FILES, **logs()}.items():
         made = {"flight.jsonl": content}
         for name, line in {
-            "eval": ("--flight", "flight.jsonl", "--out", "out"),
+            "log": ("flight.jsonl", "out"),
             "view": ("flight.jsonl", "--out", "page.html"),
             "identify": ("flight.jsonl", "--out", "plant.json"),
         }.items():
@@ -358,10 +363,9 @@ def numbers(every: dict[str, Program]) -> Iterator[Case]:
     """What says that it is larger than any computer, and plants of such numbers where others read them."""
     for flaw, make in BOMBS.items():
         for name, line in {
-            "eval": ("--flight", flaw, "--out", "out"),
+            "log": (flaw, "out.csv"),
             "view": (flaw, "--out", "page.html"),
             "identify": (flaw, "--out", "plant.json"),
-            "export": (flaw, "out.csv"),
         }.items():
             yield Case(name, f"recording: {flaw}", (*every[name].start, *line), {flaw: make})
     for flaw, (file, content) in rigs().items():
@@ -375,7 +379,7 @@ def outputs(every: dict[str, Program]) -> Iterator[Case]:
     for name, place in PLACES.items():
         line = every[name] if name != "eval" else None
         flags = () if line else ("--out", place)
-        made: Content = _full if name in ("train", "eval") else b"mine"
+        made: Content = _full if name in ("train", "eval", "app") else b"mine"
         yield _with(every[name], f"{place} exists", *flags, files={place: made})
         if name in ("train", "eval"):
             yield _with(every[name], f"{place} is a file", *flags, files={place: b"mine"})

@@ -15,12 +15,12 @@ import pytest
 
 import onboard
 from mjxball.export import in_team
-from mjxball.fly.app import host, protocol
-from mjxball.fly.app.host import App, Library, State, compile_pair
-from mjxball.fly.app.protocol import CAUSES, Phase
-from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy import PolicyFile, load_file
 from mjxball.policy.file import law_of, shipped_policy
+from mjxfly.app import host, protocol
+from mjxfly.app.host import App, Library, State, compile_pair
+from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.telemetry import ObjectState, Rig
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc is installed")
 AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3))

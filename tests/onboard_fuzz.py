@@ -17,9 +17,9 @@ from typing import Any
 from onboard_bench import policy_of
 
 from mjxball.export import in_team
-from mjxball.fly.app.generate import CORE, EXACT, files_of
-from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.policy.file import load_file, shipped_policy
+from mjxfly.app.generate import CORE, EXACT, files_of
+from mjxfly.app.protocol import CAUSES, Phase
 
 DRIVER = Path(__file__).with_suffix(".c")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")

@@ -36,12 +36,14 @@ MAINS = {
     "eval.py": "mjxball.commands.evaluate",
     "mjxball-eval": "mjxball.commands.evaluate",
     "mjxball-view": "mjxball.view.main",
-    "mjxball-fly": "mjxball.fly.main",
     "mjxball.export": "mjxball.export",
     "mjxball.view": "mjxball.view.main",
-    "mjxball.fly": "mjxball.fly.main",
+    "mjxfly": "mjxfly.main",
+    "mjxfly.app": "mjxfly.app.main",
+    "mjxfly.log": "mjxfly.log",
+    "mjxfly.view": "mjxfly.view.main",
     "mjxball.assembly": "mjxball.assembly",
-    "mjxball.rig.design": "mjxball.rig.design",
+    "mjxfly.rig.design": "mjxfly.rig.design",
 }
 
 
@@ -181,7 +183,7 @@ def shown(text: str) -> Iterator[list[str]]:
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose)]
     for line in lines:
-        if match := re.search(r"(?:^|\s|/)(?:python3? (?:-m )?|(?=mjxball-[a-z]+(?:\s|$)))(\S+(?:\s.*)?)$", line):
+        if match := re.search(r"(?:^|\s|/)(?:python3? (?:-m )?|(?=mjx[a-z]+-[a-z]+(?:\s|$)))(\S+(?:\s.*)?)$", line):
             words = shlex.split(match[1], comments=True)
             if len(words) > 1 and (words[0] in MAINS or words[0].startswith("benchmarks/")):
                 yield words
@@ -224,8 +226,8 @@ def test_commands_parse(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_reader_of_commands() -> None:
     block = "python train.py paper --seed 3  # why\n.venv/bin/python eval.py \\\n --list\nls"
-    text = f"```bash\n{block}\n```\n`python -m mjxball.fly\nx.npz`, `python -m mjxball.fly`"
-    assert list(shown(text)) == [["train.py", "paper", "--seed", "3"], ["eval.py", "--list"], ["mjxball.fly", "x.npz"]]
+    text = f"```bash\n{block}\n```\n`python -m mjxfly\nx.npz`, `python -m mjxfly`"
+    assert list(shown(text)) == [["train.py", "paper", "--seed", "3"], ["eval.py", "--list"], ["mjxfly", "x.npz"]]
 
 
 def test_a_flag_that_does_not_exist_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:

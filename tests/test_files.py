@@ -16,11 +16,11 @@ from mjxball.config import Config, read_plant, with_plant
 from mjxball.errors import InputError
 from mjxball.evaluate.scenarios import read_waveform
 from mjxball.files import MissingFileError, read_bytes, read_text, write_whole
-from mjxball.fly.preflight import read_gains
 from mjxball.policy import load_file
-from mjxball.rig.log import read_log
 from mjxball.train.run_directory import file_hash, read_config, read_json, read_rows
 from mjxball.view.flight import flight_from, load_flight
+from mjxfly.preflight import read_gains
+from mjxfly.rig.log import read_log
 
 READERS = {
     "policy": load_file,

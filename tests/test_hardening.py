@@ -39,7 +39,7 @@ def test_every_command_has_many_lines() -> None:
     assert len(cases) >= 250
     assert len({(case.program, case.flaw) for case in cases}) == len(cases)
     count = Counter(case.program for case in cases)
-    assert set(count) == {"train", "eval", "view", "fly", "export", "gains", "design", "identify"}
+    assert set(count) == {"train", "eval", "export", "fly", "view", "app", "log", "gains", "design", "identify"}
     assert min(count[name] for name in ("train", "eval", "view", "fly")) > 40
 
 
@@ -52,6 +52,8 @@ def test_some_of_its_lines_are_refused_well() -> None:
         "view": "--amplitude alone",
         "fly": "--gains empty",
         "export": "policy: noise",
+        "app": "app exists",
+        "log": "log: noise",
         "gains": "gains.json exists",
         "design": "--plant alone",
         "identify": "log: a directory",

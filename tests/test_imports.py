@@ -1,5 +1,5 @@
 """Imports run one way, along the data: config -> plant -> control -> policy | assembly -> physics -> env -> algorithms
--> train -> evaluate.
+-> train -> evaluate; and from mjxfly to mjxball.
 
 Read from the syntax tree of every module, so that a lazy import inside a function counts as well.
 """
@@ -7,6 +7,7 @@ Read from the syntax tree of every module, so that a lazy import inside a functi
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -33,11 +34,14 @@ FLOORS = (
     {"algorithms"},
     {"train"},
     {"evaluate"},
-    {"fly", "gym", "bench"},
-    {"view"},
-    {"rig", "notebook"},
+    {"gym", "bench", "view"},
+    {"notebook"},
     {"commands", "export"},
     {"entry"},
+    {"mjxfly"},
+    {"mjxfly.rig", "mjxfly.log"},
+    {"mjxfly.view"},
+    {"mjxfly.entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
 GROUND = {
@@ -52,7 +56,9 @@ GROUND = {
 }  # all of our own that `control` and `policy` may import
 # What the base install runs: NumPy alone.
 BASE = ("arrays", "errors", "reading", "pictures", "files", "config", "cli", "plant", "control", "policy", "entry")
-OURS = "mjxball"
+OURS, FLIES = "mjxball", "mjxfly"
+# What only flights need, their logs and their cameras.
+FLYING = {"cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"}
 
 
 class Module(NamedTuple):
@@ -65,12 +71,15 @@ class Module(NamedTuple):
 
     @property
     def part(self) -> str:
-        """First name below the package, '' for the package itself."""
+        """First name below mjxball, '' for the package itself; of mjxfly what stands above the rest of it."""
         return part_of(self.name)
 
 
 def part_of(name: str) -> str:
-    return name.split(".")[1] if "." in name else ""
+    house, below = [*name.split("."), ""][:2]
+    if house == FLIES:
+        return f"{FLIES}.{below}" if f"{FLIES}.{below}" in FLOOR else FLIES
+    return below
 
 
 def imports_in(node: ast.AST, kind: str, found: dict[str, set[str]]) -> None:
@@ -104,7 +113,7 @@ def read(package: Path) -> dict[str, Module]:
 
 
 def own(names: set[str]) -> set[str]:
-    return {name for name in names if name.split(".")[0] == OURS}
+    return {name for name in names if name.split(".")[0] in (OURS, FLIES)}
 
 
 def foreign(names: set[str]) -> set[str]:
@@ -176,11 +185,32 @@ def needs(modules: dict[str, Module], name: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def modules() -> dict[str, Module]:
-    return read(REPOSITORY / OURS)
+    return read(REPOSITORY / OURS) | read(REPOSITORY / FLIES)
 
 
 def test_imports_run_one_way(modules: dict[str, Module]) -> None:
     assert direction_faults(modules) == []
+
+
+def names_of_flight(text: str) -> list[str]:
+    """Where Python code reaches for mjxfly: imports anywhere, and strings that name a module, or begin with one."""
+    found: dict[str, set[str]] = {"eager": set(), "lazy": set(), "typed": set()}
+    tree = ast.parse(text)
+    imports_in(tree, "eager", found)
+    strings = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return [
+        *sorted(name for name in set().union(*found.values()) if name.split(".")[0] == FLIES),
+        *(string for string in strings if re.search(rf"(^|-m |import |from ){FLIES}\b", string)),
+    ]
+
+
+def test_what_trains_never_reaches_for_what_flies(modules: dict[str, Module]) -> None:
+    for path in (*(REPOSITORY / OURS).rglob("*.py"), *REPOSITORY.glob("*.py")):
+        assert names_of_flight(path.read_text()) == [], path
+    for name, module in modules.items():
+        if name.split(".")[0] == OURS:
+            assert not foreign(module.eager | module.lazy) & FLYING, name
+    assert set().union(*(foreign(module.eager | module.lazy) for module in modules.values())) >= FLYING
 
 
 def test_no_imports_go_in_a_circle(modules: dict[str, Module]) -> None:
@@ -205,33 +235,23 @@ def test_the_ground_floor_never_imports_jax_or_mujoco_not_even_lazily(modules: d
 
 def test_what_flies_loads_no_jax(modules: dict[str, Module]) -> None:
     """Not in a function either, nor through a module that a function imports."""
-    parts = ("fly", "rig")
-    assert {module.part for module in modules.values()} > set(parts)
     for name, module in modules.items():
-        if module.part in parts:
+        if module.part.startswith(FLIES):
             reached = foreign(module.lazy).union(
                 needs(modules, name), *(needs(modules, one) for one in own(module.lazy))
             )
             assert not reached & {"jax", "jaxlib", "flax", "brax", "optax"}, name
 
 
-def test_the_flight_path_loads_no_jax_in_truth() -> None:
-    """The same of the running interpreter: a dynamic import would escape the syntax tree."""
-    script = (
-        "import sys, mjxball.policy, mjxball.control.followers, mjxball.cli, mjxball.entry, mjxball.fly.main\n"
-        "print([name for name in ('jax', 'mujoco', 'scipy', 'matplotlib') if name in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment(), cwd=REPOSITORY
-    )
-    assert done.stdout.strip() == "[]"
+COMMANDS = {OURS: ("commands.train", "commands.evaluate", "view.main", "export")}
+COMMANDS[FLIES] = ("main", "view.main", "log", "app.main")
 
 
-@pytest.mark.parametrize("name", ["commands.train", "commands.evaluate", "fly.main", "view.main", "export"])
+@pytest.mark.parametrize("name", [f"{house}.{name}" for house, names in COMMANDS.items() for name in names])
 def test_a_command_line_is_read_without_what_computes(name: str) -> None:
     """Help and refusals come at once: JAX alone takes half a second."""
     heavy = "{'jax', 'mujoco', 'scipy.stats', 'matplotlib'}"
-    script = f"import sys, mjxball.{name}\nprint(sorted({heavy} & set(sys.modules)))"
+    script = f"import sys, {name}\nprint(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment(), cwd=REPOSITORY
     )
@@ -255,6 +275,12 @@ class TestTheReader:
     def test_lazily_upward(self, tmp_path: Path) -> None:
         text = "def f():\n    import mjxball.evaluate\n"
         assert direction_faults(self.package(tmp_path, train=text, evaluate=""))
+
+    def test_from_what_trains_to_what_flies(self, tmp_path: Path) -> None:
+        assert direction_faults(self.package(tmp_path, env="def f():\n    import mjxfly.card\n"))
+        for text in ("from mjxfly import card", "run_module('mjxfly.main')", "['-m', f'mjxfly.{name}']", "'-m mjxfly'"):
+            assert names_of_flight(text), text
+        assert not names_of_flight("raise InputError('mjxball.view: mjxfly.view plays it')")
 
     def test_between_neighbours(self, tmp_path: Path) -> None:
         assert direction_faults(self.package(tmp_path, sim="import mjxball.env", env=""))

@@ -22,12 +22,12 @@ from mjxball import __version__
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.commands.train import parser as train_parser
 from mjxball.export import main as export
-from mjxball.fly.main import make_parser as fly_parser
 from mjxball.policy import Policy, policy_path, shipped_policies, shipped_policy
 from mjxball.policy.file import load_file
 from mjxball.view.main import main as view
+from mjxfly.main import make_parser as fly_parser
 
-PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
+PARTS = ("mjxball", "mjxfly", "policies", "docs", "tests", "benchmarks")
 FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
 KINDS = {
     *(".c", ".css", ".csv", ".gif", ".h", ".ipynb", ".json"),
@@ -61,7 +61,7 @@ def parts() -> set[str]:
     """What pages are made of, the plants that have a name, and the C of the apps on board."""
     places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "evaluate/templates", "config/plants"))
     paths = [path for place in places for path in place.iterdir()]
-    paths += (path for path in (REPOSITORY / "mjxball/fly/app").iterdir() if path.suffix in (".c", ".h"))
+    paths += (path for path in (REPOSITORY / "mjxfly").rglob("*.[chj]*") if path.suffix in (".c", ".h", ".js"))
     return {str(path.relative_to(REPOSITORY)) for path in paths}
 
 
@@ -74,10 +74,10 @@ def wheel(built: Path) -> Path:
 @pytest.mark.slow
 def test_the_wheel_holds_every_module_and_policy_and_nothing_else(wheel: Path) -> None:
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "mjxball").rglob("*.py")}
+    modules = {str(path.relative_to(REPOSITORY)) for house in PARTS[:2] for path in (REPOSITORY / house).rglob("*.py")}
     policies = {f"mjxball/{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "policies").rglob("*.npz")}
     assert len(policies) >= 3
-    assert held == modules | policies | parts() | {"mjxball/py.typed", "mjxball/fly/twin/names.csv"}
+    assert held == modules | policies | parts() | {"mjxball/py.typed", "mjxfly/twin/names.csv"}
 
 
 @pytest.mark.slow
@@ -109,13 +109,13 @@ def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) 
     assert done.stdout.split() == [str(expected), str(len(shipped_policies()))]
 
 
-FLIGHT = "python -m mjxball.fly flight --rehearse --seconds 5 --log flight.jsonl"  # of the twin
+FLIGHT = "python -m mjxfly flight --rehearse --seconds 5 --log flight.jsonl"  # of the twin
 # extra -> what it is for, typed one after the other in an empty directory.
 WORKS = {
     "": [
         "python -c 'from mjxball.policy import Policy, shipped_policy; Policy.load(shipped_policy(\"balance\"))'",
         "python -m mjxball.export balance follower.h",
-        "python -m mjxball.export flight apps --crazyflie",
+        "python -m mjxfly.app flight apps",
     ],
     "train": [
         "mjxball-train --help",
@@ -124,7 +124,7 @@ WORKS = {
         "mjxball-eval --benchmark balance --tracks pair --out entry.json",
         "python -m mjxball.view balance --seconds 2 --out flight.html",
     ],
-    "fly": [FLIGHT],
+    "fly": [FLIGHT, *(f"python -m mjxfly.log flight.jsonl flight.{kind}" for kind in ("mcap", "parquet"))],
     "mocap": ["python -c 'import motioncapture'", FLIGHT],
     "gym": [
         "python -c 'import gymnasium, mjxball.gym; gymnasium.make(\"mjxball/Flight-v0\").reset(seed=0)'",
@@ -136,7 +136,6 @@ WORKS = {
         "jaxmarl.LogWrapper(FollowersMultiAgentEnv()).reset(jax.random.key(0))'"
     ],
     "onnx": ["python -m mjxball.export flight flight.onnx"],
-    "fly,logs": [FLIGHT, *(f"python -m mjxball.export flight.jsonl flight.{kind}" for kind in ("mcap", "parquet"))],
     "train,mpc": ["mjxball-eval --followers mpc --seconds 1"],
     "view": ["python -m mjxball.view flight --seconds 2 --out flight.html"],
     "video": ["python -m mjxball.view flight --seconds 1 --video flight.mp4"],

@@ -20,12 +20,6 @@ from mjxball.control.axes import axes
 from mjxball.control.constants import hover
 from mjxball.control.margins import REQUIREMENTS as NEED
 from mjxball.evaluate import metrics
-from mjxball.fly import card, measured, monitor, positioning, preflight, probe, setpoints, takeoff, uri, watchdog
-from mjxball.fly.app import protocol
-from mjxball.fly.limits import Limits, Times
-from mjxball.fly.mocap_supervision import MocapLimits
-from mjxball.fly.twin.conditions import Battery
-from mjxball.fly.twin.coupled import WORN_SAG
 from mjxball.physics import engine
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import heaviest_object, largest_amplitude
@@ -35,7 +29,13 @@ from mjxball.sim import disturbances
 from mjxball.sim.rigs import HELD_OUT_RIGS
 from mjxball.train import lock, loop
 from mjxball.train.program import EVALUATION_SECONDS
-from mjxball.view import live
+from mjxfly import card, measured, monitor, positioning, preflight, probe, setpoints, takeoff, uri, watchdog
+from mjxfly.app import protocol
+from mjxfly.limits import Limits, Times
+from mjxfly.mocap_supervision import MocapLimits
+from mjxfly.twin.conditions import Battery
+from mjxfly.twin.coupled import WORN_SAG
+from mjxfly.view import live
 
 DEG = 180 / math.pi
 PAIR, OLDER, UPGRADE, BRUSHLESS = (
@@ -55,7 +55,7 @@ REACH = [100 * largest_amplitude(one, 0.2, 0.0, (0.0, 1.0)) for one in (WIDE.pla
 FULL = float(motors.force(motors.MOTORS["2.1"], np.array(crazyflie.FULL), 3.0 - WORN_SAG))
 LIFT = 8 * FULL / 9.81 / total_mass(RIG)  # share of the weight that a battery of 3 V carries
 NOISE = disturbances.NOISE[[0, 3, 6, 9]] * [1e3, DEG, 1, 1]
-APP = "".join(path.read_text() for path in sorted((REPOSITORY / "mjxball/fly/app").glob("*.[ch]")))
+APP = "".join(path.read_text() for path in sorted((REPOSITORY / "mjxfly/app").glob("*.[ch]")))
 C = {name: float(value) for name, value in re.findall(r"#define (\w+) ([\d.e-]+)[fu]?\b", APP)}
 
 

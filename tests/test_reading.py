@@ -22,16 +22,16 @@ from mjxball.config import preset, read_plant
 from mjxball.config._model import read_model
 from mjxball.errors import InputError
 from mjxball.evaluate.scenarios import read_waveform
-from mjxball.fly import flight_log
-from mjxball.fly.crazyswarm import read_pair
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.preflight import read_gains
 from mjxball.policy.file import load_file, shipped_policy
 from mjxball.reading import check_times, following, is_number, parse_json, parse_toml
 from mjxball.train.curves import training_curve
 from mjxball.train.progress import COMMON, Progress
 from mjxball.train.run_directory import read_config, read_rows, read_sweep, write_config
 from mjxball.view.flight import Flight, load_flight, save_flight, shapes
+from mjxfly import flight_log
+from mjxfly.crazyswarm import read_pair
+from mjxfly.flight_log import Journal
+from mjxfly.preflight import read_gains
 
 
 def test_json_is_that_of_the_standard_library_but_for_keys_that_stand_twice() -> None:
@@ -45,7 +45,7 @@ def test_json_is_that_of_the_standard_library_but_for_keys_that_stand_twice() ->
 
 def test_the_package_reads_json_in_one_place() -> None:
     found = set()
-    for path in (REPOSITORY / "mjxball").rglob("*.py"):
+    for path in REPOSITORY.glob("mjx*/**/*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             called = node.func if isinstance(node, ast.Call) else node
             if isinstance(called, ast.Attribute) and called.attr in ("load", "loads"):

@@ -100,7 +100,7 @@ def site_of(extra: str, place: Path) -> Path:
 @pytest.fixture
 def here(tmp_path: Path) -> Path:
     """A directory that looks like a checkout."""
-    for name in ("policies", "mjxball", "train.py", "eval.py"):
+    for name in ("policies", "mjxball", "mjxfly", "train.py", "eval.py"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
     return tmp_path
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from command_line import REPOSITORY
 
-PACKAGE = REPOSITORY / "mjxball"
-SOURCES = sorted(PACKAGE.rglob("*.py"))
+PACKAGE, FLIES = REPOSITORY / "mjxball", REPOSITORY / "mjxfly"
+SOURCES = sorted([*PACKAGE.rglob("*.py"), *FLIES.rglob("*.py")])
 QUOTED = re.compile(r"`([A-Za-z_][\w./]*)(?:\(\))?`")
 FILE = re.compile(r"\.(py|c|h|md|js|npz|csv|json|jsonl|toml|html|onnx|elf|svg|png)$")
 FOREIGN = {"jax", "jnp", "lax", "np", "mjx", "mujoco", "brax", "scipy", "gymnasium", "sys", "ZipFile"}
@@ -66,7 +66,8 @@ def texts(path: Path) -> Iterator[tuple[int, str, set[str]]]:
 
 def is_file(name: str) -> bool:
     """Whether `name` is that of a file or folder: the repository's, or one that a command reads or writes."""
-    places = (REPOSITORY, PACKAGE, *(REPOSITORY / folder for folder in ("docs", "benchmarks", "tests", "policies")))
+    folders = (REPOSITORY / folder for folder in ("docs", "benchmarks", "tests", "policies"))
+    places = (REPOSITORY, PACKAGE, FLIES, *folders)
     return ("/" not in name and FILE.search(name) is not None) or any((place / name).exists() for place in places)
 
 
@@ -88,7 +89,7 @@ def stale(path: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_what_is_quoted_exists(path: Path) -> None:
     assert stale(path) == []
 
@@ -96,5 +97,5 @@ def test_what_is_quoted_exists(path: Path) -> None:
 def test_a_stale_name_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("test_references.REPOSITORY", tmp_path)
     path = tmp_path / "module.py"
-    path.write_text('"""See `fly.link.Link`, `fly.link.Lnk`, `fly/lnk.py` and `fly.card.Controller.step`."""\n')
-    assert [line.rpartition(": ")[2] for line in stale(path)] == ["fly.link.Lnk", "fly/lnk.py"]
+    path.write_text('"""See `mjxfly.link.Link`, `mjxfly.link.Lnk`, `mjxfly/lnk.py` and `card.Controller.step`."""\n')
+    assert [line.rpartition(": ")[2] for line in stale(path)] == ["mjxfly.link.Lnk", "mjxfly/lnk.py"]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import pytest
 
 from mjxball import files, xla
-from mjxball.fly import connection
+from mjxfly import connection
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjxball.fly.twin.protocol import Peer, header
+from mjxfly.twin.protocol import Peer, header
 
 
 def written(peer: Peer, name: str, value: float, now: float) -> float:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mjxball.fly.packets import EXTERNAL_POSE, MILLI, POSE, STATE, DroneState, PacketError, compress_quaternion
+from mjxfly.packets import EXTERNAL_POSE, MILLI, POSE, STATE, DroneState, PacketError, compress_quaternion
 
 
 def pack_state(state: DroneState) -> bytes:

@@ -9,20 +9,20 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from mjxball.fly import lift, setpoints
-from mjxball.fly.card import config_of
-from mjxball.fly.limits import STAND_SPARE, Limits, Times
-from mjxball.fly.log_schema import KINDS
-from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, VARIABLES
-from mjxball.fly.main import make_parser
-from mjxball.fly.mocap_supervision import MocapLimits
-from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
-from mjxball.fly.setpoints import CommandMap
-from mjxball.fly.supervisor import TRANSITIONS, Event, State
-from mjxball.fly.twin.conditions import FAULT_KINDS, Conditions
-from mjxball.fly.twin.drone import ACTED
+from mjxfly.twin.conditions import FAULT_KINDS, Conditions
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
+from mjxfly import lift, setpoints
+from mjxfly.card import config_of
+from mjxfly.limits import STAND_SPARE, Limits, Times
+from mjxfly.log_schema import KINDS
+from mjxfly.log_sources import HEADER, RECORD, TOPICS, VARIABLES
+from mjxfly.main import make_parser
+from mjxfly.mocap_supervision import MocapLimits
+from mjxfly.packets import THRUST_CEILING, THRUST_FLOOR
+from mjxfly.setpoints import CommandMap
+from mjxfly.supervisor import TRANSITIONS, Event, State
+from mjxfly.twin.drone import ACTED
 
 
 def log_kinds() -> str:
@@ -59,7 +59,7 @@ def transitions() -> str:
 
 
 def flags() -> str:
-    """The flags of `python -m mjxball.fly`."""
+    """The flags of `python -m mjxfly`."""
     lines = ["| flag | meaning |", "|---|---|"]
     for action in make_parser()._actions:
         if action.option_strings and action.dest not in ("help", "version"):

@@ -15,7 +15,6 @@ from pathlib import Path
 from mjxball import cli, config
 from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES
 from mjxball.bench.tracks import TRACKS
-from mjxball.commands.flight_log import evaluate_log
 from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
@@ -100,7 +99,6 @@ def parser() -> cli.Parser:
     result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {figures}, or all")
     about = "of figures: screen (default), or paper: PDF of a column's width"
     result.add_argument("--style", choices=STYLES, default="screen", help=about)
-    result.add_argument("--flight", type=Path, metavar="LOG", help="draw a flight log or a bag, its commands simulated")
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the benchmark suites and stop")
     result.add_argument(
@@ -124,8 +122,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     def run() -> int:
         if options.style != "screen" and (options.out is None or options.suite or options.benchmark):
-            raise InputError("--style belongs to figures of --figures, --flight or a comparison, and needs --out DIR")
-        return _evaluate(options, given) if options.flight is None else _flight(options)
+            raise InputError("--style belongs to figures of --figures or a comparison, and needs --out DIR")
+        return _evaluate(options, given)
 
     return cli.run_command(run)
 
@@ -305,18 +303,6 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
     if options.json:
         write_whole(options.json, to_json(every))
     return code
-
-
-def _flight(options: argparse.Namespace) -> int:
-    """Draw a flight log; what was flown is the log's, so that no other flag but --out and --plant goes with it."""
-    others = [name for name in ("figures", *NOT_WITH_FIGURES) if name != "plant"]
-    given = [name for name in others if getattr(options, name) not in (None, False, [])]
-    if options.policies or given:
-        what = "the policies" if options.policies else f"--{given[0].replace('_', '-')}"
-        raise InputError(f"--flight draws what was flown; drop {what}")
-    if options.out is None:
-        raise InputError("--flight needs --out DIR, a directory to write to")
-    return evaluate_log(options.flight, options.out, options.style, options.plant)
 
 
 def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""A flight to play: recorded in a file, read from a flight log, or flown on the spot.
+"""A flight to play: recorded in a file, or flown on the spot.
 
 The file is one `.npz` without pickles; reading verifies everything it uses.
 """
@@ -9,27 +9,23 @@ import dataclasses
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball import config as configs
 from mjxball.cli import plant_setup
 from mjxball.config import Plant
-from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.files import write_whole
-from mjxball.fly.log_bags import is_bag
-from mjxball.fly.log_import import UNKNOWN
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
 from mjxball.terminal import warn
-from mjxball.view.marks import Mark, marks_of_log, read_marks
 
 if TYPE_CHECKING:
     from mjxball.sim.rollout import Trajectory
@@ -37,6 +33,17 @@ if TYPE_CHECKING:
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20
 STEPS = (1e-4, 1.0)  # [s] between two rows, as a rule
+KINDS = ("phase", "fault", "end")  # of marks
+LEVELS = ("", "good", "bad")
+
+
+class Mark(NamedTuple):
+    """Something on the time axis: a phase, which lasts until the next one, a fault, or the end."""
+
+    time: float  # [s]
+    kind: str
+    text: str
+    level: str
 
 
 def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
@@ -104,6 +111,14 @@ def load_flight(path: str | os.PathLike[str]) -> Flight:
     return check_flight(Flight(title[:200], plant, arrays, marks), str(path))
 
 
+def read_marks(values: Any) -> tuple[Mark, ...]:
+    """Marks as a flight file has them. Raises ValueError or TypeError if they are none."""
+    marks = tuple(Mark(float(t), str(kind), str(text)[:500], str(level)) for t, kind, text, level in values[:1000])
+    if any(mark.kind not in KINDS or mark.level not in LEVELS or not abs(mark.time) < 1e9 for mark in marks):
+        raise ValueError
+    return marks
+
+
 def check_flight(flight: Flight, name: str) -> Flight:
     """`flight` if every array has its shape and is finite and time runs, else InputError."""
     rows = np.shape(flight.arrays.get("time", 0.0))
@@ -137,21 +152,31 @@ def is_flight(path: Path) -> bool:
         return False
 
 
+def _unknown(path: Path) -> Flight:
+    raise InputError(f"{path} is no flight (.npz), policy (.npz) or run directory; mjxfly.view plays flight logs")
+
+
 def flight_from(
-    source: str, changes: Mapping[str, Any], physics: str, plant: Path | None = None, hidden: bool = False
+    source: str,
+    changes: Mapping[str, Any],
+    physics: str,
+    plant: Path | None = None,
+    hidden: bool = False,
+    read_other: Callable[[Path], Flight] = _unknown,
 ) -> Flight:
     """The flight that `source` names; with `hidden`, what its follower's GRU remembers as well.
 
-    A flight file or a flight log is read. A policy file, a run directory (its `policy.npz`), the name of a classical
-    follower or module:Class, one's own, is flown through its reference scenario with `changes` to the fields of
-    `Scenario`, on the paper's plant; a policy made for Crazyflies on its own; or on `plant`, a plant file or a shipped
-    one's name. Raises InputError if it is none of these, or has no GRU where its state is asked for.
+    A flight file is read, and any file that is no .npz by `read_other`. A policy file, a run directory (its
+    `policy.npz`), the name of a classical follower or module:Class, one's own, is flown through its reference scenario
+    with `changes` to the fields of `Scenario`, on the paper's plant; a policy made for Crazyflies on its own; or on
+    `plant`, a plant file or a shipped one's name. Raises InputError if it is none of these, or has no GRU where its
+    state is asked for.
     """
     path = Path(source)
     if path.suffix == ".npz" and path.is_file() and is_flight(path):
         found = load_flight(path)
     elif path.is_file() and path.suffix != ".npz":
-        found = read_log(path)
+        found = read_other(path)
     else:
         found = _flown(source, changes, physics, plant, hidden)
     if hidden and "hidden" not in found.arrays:
@@ -161,45 +186,6 @@ def flight_from(
 
 def _without_hidden(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: array for name, array in arrays.items() if name != "hidden"}
-
-
-def read_log(path: Path) -> Flight:
-    """The flight in a log of `mjxball.fly`, from where its motors first turned.
-
-    The CG, the object's mass and the contact forces are not in a log: they are 0 and the plant's mass here, and no page
-    shows them.
-    """
-    from mjxball.fly.recording import read_recording
-
-    if path.suffix != ".jsonl" and not is_bag(path):
-        raise InputError(
-            f"{path} is no flight (.npz), flight log (.jsonl) or bag (.mcap), policy (.npz) or run directory"
-        )
-    recording = read_recording(path)
-    if recording.policy == UNKNOWN:
-        raise InputError(f"{path} says no goal that could be shown; eval.py --flight draws it")
-    for remark in recording.remarks:
-        warn(remark)
-    rows = len(recording.time)
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion))
-    arrays = {
-        "time": recording.time,
-        "position": recording.position,
-        "velocity": recording.velocity,
-        "euler": euler,
-        "quaternion": recording.quaternion,
-        "rotor_force": recording.rotor_force,
-        "leader_command": np.nan_to_num(recording.leader),
-        "follower_command": np.nan_to_num(recording.follower),
-        "cg_offset": np.zeros(rows),
-        "object_mass": np.full(rows, recording.config.plant.object_mass),
-        "contact_force": np.zeros((rows, 2, 3)),
-        "target": recording.target,
-        **({"hidden": np.nan_to_num(recording.hidden)} if recording.hidden.shape[1] else {}),
-    }
-    title = f"{recording.policy}, flown (ball and contact forces were not measured)"
-    marks = marks_of_log(path, float(recording.time[-1]))
-    return check_flight(Flight(title, recording.config.plant, arrays, marks), str(path))
 
 
 def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:

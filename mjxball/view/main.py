@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import tempfile
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mjxball.cli import Parser, make_parser, output_file, run_command
@@ -21,14 +21,19 @@ CHANGES = ("omega", "amplitude", "mass", "goal", "seconds")  # flags, and fields
 
 def parser() -> Parser:
     """The argument parser of `python -m mjxball.view`."""
-    about = "Play a flight in the browser: one HTML page that needs neither a server nor a network; or watch one live."
-    result = make_parser("python -m mjxball.view", about)
+    return make_view_parser("python -m mjxball.view", "recorded flight (.npz)")
+
+
+def make_view_parser(name: str, recorded: str) -> Parser:
+    """The argument parser of the command `name`, which plays what is `recorded`."""
+    about = "Play a flight in the browser: one HTML page that needs neither a server nor a network."
+    result = make_parser(name, about)
     result.add_argument(
         "source",
         nargs="+",
-        metavar="POLICY|RUN|LOG",
-        help="recorded flight (.npz), flight log (.jsonl, .mcap), or what to fly: a run directory, policy, baseline or "
-        "module:Class, your own; two are shown side by side with one clock",
+        metavar="POLICY|RUN|FLIGHT",
+        help=f"{recorded}, or what to fly: a run directory, policy, baseline or module:Class, your own; two are shown "
+        "side by side with one clock",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
     result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")
@@ -40,13 +45,6 @@ def parser() -> Parser:
         "--video", type=Path, metavar="FILE.mp4|FILE.gif", help="write a video instead of a page, and open nothing"
     )
     film.add_argument("--speed", type=float, metavar="X", help="flight time over playing time (1)")
-    live = result.add_argument_group("while it is flown")
-    live.add_argument(
-        "--live", action="store_true", help="follow a flight log that is being written, on a page of this machine alone"
-    )
-    live.add_argument("--port", type=int, default=None, metavar="PORT", help="of that page (a free one)")
-    live.add_argument("--foxglove", type=int, metavar="PORT", help="for Foxglove too, on this machine alone")
-    live.add_argument("--attached", action="store_true", help=argparse.SUPPRESS)  # end when standard input does
     flown = result.add_argument_group(
         "scenario of what is flown on the spot", "the follower's reference scenario, changed by"
     )
@@ -65,16 +63,15 @@ def parser() -> Parser:
 def main(arguments: list[str] | None = None) -> int:
     """Show a flight; return the exit code."""
     options = parser().parse_args(arguments)
-    return run_command(lambda: _view(options))
+    return run_command(lambda: show(options, flight_from))
 
 
-def _view(options: argparse.Namespace) -> int:
+def show(options: argparse.Namespace, flight_from: Callable[..., Flight]) -> int:
+    """Play what `options` name, each read or flown by `flight_from`; return the exit code. Raises InputError."""
     if len(options.source) > 2:
         raise InputError(f"two flights fit side by side, not {len(options.source)}")
     if options.speed is not None and not options.video:
         raise InputError("--speed is of --video; a page has its own")
-    if options.live:
-        return _follow(options)
     _check(options)
     given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
     flights = [flight_from(one, given, options.physics, options.plant, options.hidden) for one in options.source]
@@ -98,10 +95,6 @@ def _view(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> None:
     """Refuse what does not go together, before anything is flown."""
-    if options.port is not None:
-        raise InputError("--port is the port of --live; any other page needs no server")
-    if options.foxglove is not None:
-        raise InputError("--foxglove goes with --live; any other flight can be opened in Foxglove as a file")
     if options.save and len(options.source) > 1:
         raise InputError("--save writes one flight: leave one of the two out")
     if options.speed is not None and not 0.01 <= options.speed <= 100:
@@ -121,21 +114,3 @@ def _video(flights: Sequence[Flight], suffix: str, speed: float) -> bytes:
         labels = [f"{label} {number}" for number, label in enumerate(labels, 1)]
     shown = {label: flight.arrays for label, flight in zip(labels, flights, strict=True)}
     return render([flight.plant for flight in flights], shown, suffix, speed=speed)
-
-
-def _follow(options: argparse.Namespace) -> int:
-    from mjxball.view.live import follow
-
-    if len(options.source) > 1:
-        raise InputError("--live follows one log")
-    if options.hidden:
-        raise InputError("--hidden is of a flight that has ended: leave it out of --live")
-    if options.out or options.save or options.video:
-        raise InputError("--live writes no file; play the log with --out, --save or --video once the flight has ended")
-    path, port = Path(options.source[0]), options.port or 0
-    for name, number in (("port", port), ("foxglove", options.foxglove or 0)):
-        if not 0 <= number <= 65535:
-            raise InputError(f"--{name} must be 1 to 65535, not {number}")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"directory {path.absolute().parent} of the log does not exist")
-    return follow(path, port, options.attached, options.foxglove)

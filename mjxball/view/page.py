@@ -29,16 +29,13 @@ SCENE = {"goal": GREEN, "cg": OLIVE, "thrust": SKY, "contact": PINK, "weight": B
 
 def flight_page(*flights: Flight) -> str:
     """The page's text; the flights, one or two side by side, are inside, as float32."""
-    return _page(" | ".join(flight.title for flight in flights), [page_contents(one) for one in flights], "recorded.js")
+    title, contents = " | ".join(flight.title for flight in flights), [page_contents(one) for one in flights]
+    return page_of(title, contents, PARTS / "recorded.js")
 
 
-def live_page(title: str, token: str) -> str:
-    """The page that asks its server for a flight while it is flown (`view/live.py`); `token` names the server."""
-    return _page(title, {"token": token}, "live.js")
-
-
-def _page(title: str, data: Any, start: str) -> str:
-    script = "\n".join((PARTS / name).read_text(encoding="utf-8") for name in (*SCRIPTS, start))
+def page_of(title: str, data: Any, start: Path) -> str:
+    """The viewer's page with `data` inside, begun by the script in the file `start`."""
+    script = "\n".join(path.read_text(encoding="utf-8") for path in (*(PARTS / name for name in SCRIPTS), start))
     colours = " ".join(f"--{name}: {colour};" for name, colour in (DRONES | AXES | SCENE | {"good": GREEN}).items())
     parts = {
         "title": html.escape(title),

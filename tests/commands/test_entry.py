@@ -20,9 +20,9 @@ from tables import rows
 from mjxball import __version__
 
 MODULES = (
-    *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxball.rig.gains", "mjxball.rig.identify"),
-    "mjxball.rig.design",
-    *("mjxball.fly", "mjxball.fly.twin", "mjxball.fly.watchdog"),
+    *("mjxball.export", "mjxball.assembly", "mjxball.view"),
+    *("mjxfly", "mjxfly.twin", "mjxfly.watchdog", "mjxfly.view", "mjxfly.log", "mjxfly.app"),
+    *("mjxfly.rig.design", "mjxfly.rig.gains", "mjxfly.rig.identify"),
 )
 COMMANDS = (*MODULES, "train.py", "eval.py")
 
@@ -90,7 +90,7 @@ def test_installed_commands_are_completed_by_their_own_name(
 ) -> None:
     pytest.importorskip("shtab")
     installed = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
-    assert {f"mjxball-{name}" for name in ("train", "eval", "view", "fly", "export")} <= set(installed)
+    assert {f"mjxball-{name}" for name in ("train", "eval", "view", "export")} | {"mjxfly"} <= set(installed)
     for name, place in installed.items():
         monkeypatch.setattr(sys, "argv", [f"/bin/{name}", "--print-completion", "bash"])
         handler = signal.getsignal(signal.SIGINT)
@@ -101,7 +101,7 @@ def test_installed_commands_are_completed_by_their_own_name(
         assert re.search(rf"^complete .* {name}$", capsys.readouterr().out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxball.fly", "--version"), ("eval.py", "--list")])
+@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxfly", "--version"), ("eval.py", "--list")])
 @pytest.mark.parametrize("buffered", [True, False])
 def test_what_cannot_be_printed_is_said(words: tuple[str, ...], buffered: bool) -> None:
     """Nor is a second line said by Python, which tries again as it ends."""

@@ -15,7 +15,7 @@ from mjxball import config
 from mjxball.commands.evaluate import parser as eval_parser
 from mjxball.commands.train import COMMON
 from mjxball.commands.train import parser as train_parser
-from mjxball.fly.main import make_parser as fly_parser
+from mjxfly.main import make_parser as fly_parser
 
 PARSERS = {"train": train_parser, "eval": eval_parser, "fly": fly_parser}
 Helped = Callable[..., str]
@@ -118,7 +118,7 @@ def test_bash_completes_what_the_script_says(helped: Helped, tmp_path: Path) -> 
 def test_no_command_imports_what_only_completion_and_tables_need() -> None:
     """They would be a fifth of a second of every start."""
     look = "import sys; from {} import {} as p; p(); print(sorted({{'rich', 'shtab', 'IPython'}} & set(sys.modules)))"
-    for module, name in (("mjxball.fly.main", "make_parser"), ("mjxball.commands.train", "parser")):
+    for module, name in (("mjxfly.main", "make_parser"), ("mjxball.commands.train", "parser")):
         command = [sys.executable, "-c", look.format(module, name)]
         done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=REPOSITORY, env=environment())
         assert done.stdout == "[]\n", module

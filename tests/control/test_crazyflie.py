@@ -16,8 +16,8 @@ from mjxball.cli import apply_plant
 from mjxball.config import PLANTS, Autopilot, preset, replace, validate, with_plant
 from mjxball.control import crazyflie, mixer
 from mjxball.errors import InputError
-from mjxball.fly import packets
-from mjxball.fly.setpoints import CommandMap, ForceCurve, to_setpoint
+from mjxfly import packets
+from mjxfly.setpoints import CommandMap, ForceCurve, to_setpoint
 
 STOCK = Autopilot(kind="crazyflie")
 LEVEL, STILL = np.zeros(3), np.zeros(3)

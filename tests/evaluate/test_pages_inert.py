@@ -19,15 +19,15 @@ from mjxball.evaluate import report as report_page
 from mjxball.evaluate import suites
 from mjxball.evaluate.benchmark import run_benchmark
 from mjxball.evaluate.report import write_report
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.physics import make_pair
 from mjxball.policy import Policy, load_file, shipped_policy
-from mjxball.view.flight import flight_from
-from mjxball.view.live import LiveView, Server
-from mjxball.view.live_log import LiveLog
 from mjxball.view.page import flight_page, page_contents
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.supervisor import State
+from mjxfly.twin.physics import make_pair
+from mjxfly.view.live import LiveView, Server
+from mjxfly.view.live_log import LiveLog
+from mjxfly.view.recorded import read_log
 
 # As a file's name, which holds no slash; placeholders are those of our own templates, dollars begin a formula.
 NAME = "<script>document.title='gone'<img src=x onerror=document.title='gone'>{{script}}{{data}} $\\frac{$ &amp;"
@@ -82,7 +82,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_flight_log_with_hostile_texts_in_the_viewer(browser: Any, log: Path, tmp_path: Path) -> None:
     """And a recorded flight whose title is one."""
-    shown = flight_from(str(log), {}, "newton-euler")
+    shown = read_log(log)
     for flight in (shown, dataclasses.replace(shown, title=TEXT), dataclasses.replace(shown, title=NAME)):
         (tmp_path / "page.html").write_text(flight_page(flight), encoding="utf-8")
         tab = opened(browser, tmp_path / "page.html", 1000)
@@ -97,7 +97,7 @@ def test_a_flight_log_with_hostile_texts_in_the_viewer(browser: Any, log: Path, 
 
 def test_hostile_names_of_what_is_plotted_stay_text(browser: Any, log: Path, tmp_path: Path) -> None:
     """The script writes no name as HTML, whatever the page's data holds."""
-    shown = flight_from(str(log), {}, "newton-euler")
+    shown = read_log(log)
     (tmp_path / "page.html").write_text(flight_page(shown), encoding="utf-8")
     tab = opened(browser, tmp_path / "page.html", 1000)
     tab.evaluate(

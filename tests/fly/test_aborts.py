@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from fly_virtual import VirtualTwin, thrusts
 
-from mjxball.fly.limits import FlightSettings, Times
-from mjxball.fly.packets import THRUST_CEILING
-from mjxball.fly.supervisor import Event, State
-from mjxball.fly.twin.conditions import FAULT_KINDS
-from mjxball.fly.twin.virtual import MemoryLog
-from mjxball.fly.twin.virtual import VirtualTwin as CoupledTwin
 from mjxball.policy import Policy, shipped_policy
+from mjxfly.limits import FlightSettings, Times
+from mjxfly.packets import THRUST_CEILING
+from mjxfly.supervisor import Event, State
+from mjxfly.twin.conditions import FAULT_KINDS
+from mjxfly.twin.virtual import MemoryLog
+from mjxfly.twin.virtual import VirtualTwin as CoupledTwin
 
 
 def silence_down(world: VirtualTwin, number: int) -> None:

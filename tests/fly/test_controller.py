@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from wire import pack_state
 
 from mjxball.control import observation, rotations
-from mjxball.fly import process
-from mjxball.fly.card import Controller, config_of
-from mjxball.fly.packets import DroneState, unpack_state
-from mjxball.fly.process import Metronome
-from mjxball.fly.telemetry import Rig, object_state
 from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.sim.laws import Laws
+from mjxfly import process
+from mjxfly.card import Controller, config_of
+from mjxfly.packets import DroneState, unpack_state
+from mjxfly.process import Metronome
+from mjxfly.telemetry import Rig, object_state
 
 small = st.floats(-0.5, 0.5)
 triples = st.tuples(small, small, small)

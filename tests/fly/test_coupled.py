@@ -11,13 +11,13 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
-from mjxball.fly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
-from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.pair import PairState
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state
 from mjxball.plant import plant_parameters
+from mjxfly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
+from mjxfly.twin.coupled import CoupledPair
+from mjxfly.twin.pair import PairState
 
 PRESETS = ("flight", "stand")
 PERIOD = 0.005  # the twin's

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from mjxball import config as configs
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
-from mjxball.fly import card
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.setpoints import ForceCurve, to_setpoint
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.physics import StandIn, make_pair
 from mjxball.plant import plant_parameters
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
+from mjxfly import card
+from mjxfly.limits import FlightSettings
+from mjxfly.setpoints import ForceCurve, to_setpoint
+from mjxfly.supervisor import State
+from mjxfly.twin.physics import StandIn, make_pair
 
 PRESETS = ("flight", "stand")
 vertical = st.floats(-4, 4)

@@ -12,9 +12,9 @@ from command_line import TRANSPORT, assert_one_line, call
 from tables import rows
 
 from mjxball.errors import InputError
-from mjxball.fly.crazyswarm import read_pair
-from mjxball.fly.main import main
-from mjxball.fly.telemetry import Rig
+from mjxfly.crazyswarm import read_pair
+from mjxfly.main import main
+from mjxfly.telemetry import Rig
 
 yaml = pytest.importorskip("yaml")
 RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))

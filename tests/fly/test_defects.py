@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from mjxball.control.rotations import roll_of_quaternion
-from mjxball.fly.card import Controller, goal_of, times_of
-from mjxball.fly.limits import FlightSettings, Limits
-from mjxball.fly.packets import FLYING, LOCKED
-from mjxball.fly.preflight import curve_of_version
-from mjxball.fly.supervisor import Event, State
-from mjxball.fly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
+from mjxfly.card import Controller, goal_of, times_of
+from mjxfly.limits import FlightSettings, Limits
+from mjxfly.packets import FLYING, LOCKED
+from mjxfly.preflight import curve_of_version
+from mjxfly.supervisor import Event, State
+from mjxfly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
+from mjxfly.twin.virtual import MemoryLog, VirtualTwin
 
 pytest.importorskip("mujoco")
 

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 from command_line import environment
 
-from mjxball.fly.display import RED, Display, View, lines
-from mjxball.fly.limits import Limits
-from mjxball.fly.packets import ZERO, DroneState
-from mjxball.fly.supervisor import Event, Fault, State, Supervisor
+from mjxfly.display import RED, Display, View, lines
+from mjxfly.limits import Limits
+from mjxfly.packets import ZERO, DroneState
+from mjxfly.supervisor import Event, Fault, State, Supervisor
 
 pytestmark = pytest.mark.clock  # keys and pictures by the clock
 
@@ -114,7 +114,7 @@ def test_the_keys_are_shown() -> None:
 
 SCRIPT = """
 import sys, time
-from mjxball.fly.display import listening
+from mjxfly.display import listening
 heard = []
 with listening(*(lambda word=word: heard.append(word) for word in ("land", "interrupt", "kill"))):
     print("ready", flush=True)

@@ -10,8 +10,8 @@ import sys
 import pytest
 from command_line import REPOSITORY
 
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import POSITIONING
+from mjxfly.supervisor import State
+from mjxfly.twin.conditions import POSITIONING
 
 DOCS = REPOSITORY / "docs"
 SUPERVISOR = (DOCS / "supervisor.md").read_text(encoding="utf-8")

@@ -9,9 +9,9 @@ import pytest
 from fly_virtual import VirtualTwin
 from tables import rows
 
-from mjxball.fly.ending import Signals, Touchdown
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.supervisor import Event, Fault, State
+from mjxfly.ending import Signals, Touchdown
+from mjxfly.limits import FlightSettings
+from mjxfly.supervisor import Event, Fault, State
 
 LINK, OLD = Fault(Event.LINK_LOST, "leader: nothing can be sent"), Fault(Event.STALE, "state of the leader is 0 ms old")
 BUSY, TILT = Fault(Event.DEADLINES, "12 missed in a second"), Fault(Event.TILT, "follower tilts 41 degrees")

@@ -12,16 +12,16 @@ from tables import rows
 
 from mjxball.control import motors
 from mjxball.control.motors import MOTORS
-from mjxball.fly.card import command_maps, config_of
-from mjxball.fly.lift import ALL, LiftWatch
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.setpoints import CommandMap
-from mjxball.fly.supervisor import Event, State
-from mjxball.fly.telemetry import ObjectState, Rig
-from mjxball.fly.twin.conditions import FAULT_KINDS
-from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
+from mjxfly.card import command_maps, config_of
+from mjxfly.lift import ALL, LiftWatch
+from mjxfly.limits import FlightSettings
+from mjxfly.setpoints import CommandMap
+from mjxfly.supervisor import Event, State
+from mjxfly.telemetry import ObjectState, Rig
+from mjxfly.twin.conditions import FAULT_KINDS
+from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
 
 FLIGHT = shipped_policy("flight")
 HEIGHT = 0.4  # [m] of the hover

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjxball.fly.figures import LEAST, SETTLING, Flown
+from mjxfly.figures import LEAST, SETTLING, Flown
 
 
 def test_figures_are_of_two_seconds_at_least_and_show_the_motors() -> None:

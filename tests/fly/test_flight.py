@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import rows
 
-from mjxball.fly import packets, session
-from mjxball.fly.limits import FlightSettings, Times
-from mjxball.fly.setpoints import LastKnownState, Variant
-from mjxball.fly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
-from mjxball.fly.watchdog import PERIOD, way_down
+from mjxfly import packets, session
+from mjxfly.limits import FlightSettings, Times
+from mjxfly.setpoints import LastKnownState, Variant
+from mjxfly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
+from mjxfly.watchdog import PERIOD, way_down
 
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
 

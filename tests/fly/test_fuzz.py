@@ -13,16 +13,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjxball.fly import packets
-from mjxball.fly.connection import Deadlines, LinkError
-from mjxball.fly.link import Link
-from mjxball.fly.twin import logs
-from mjxball.fly.twin.conditions import DroneFaults
-from mjxball.fly.twin.drone import garbage
-from mjxball.fly.twin.firmware import BOOT_TIME, Firmware
-from mjxball.fly.twin.physics import StandIn
-from mjxball.fly.twin.protocol import MAX_DATA, Peer
-from mjxball.fly.twin.server import HOST, Twin
+from mjxfly import packets
+from mjxfly.connection import Deadlines, LinkError
+from mjxfly.link import Link
+from mjxfly.twin import logs
+from mjxfly.twin.conditions import DroneFaults
+from mjxfly.twin.drone import garbage
+from mjxfly.twin.firmware import BOOT_TIME, Firmware
+from mjxfly.twin.physics import StandIn
+from mjxfly.twin.protocol import MAX_DATA, Peer
+from mjxfly.twin.server import HOST, Twin
 
 READINGS = {name: 1e12 for name, _ in logs.LOG_VARIABLES}
 ports = st.sampled_from(

@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 
 from mjxball.errors import InputError
-from mjxball.fly import packets
-from mjxball.fly.connection import REACH, Deadlines, LinkError
-from mjxball.fly.link import Link
-from mjxball.fly.packets import Setpoint
-from mjxball.fly.preflight import Preflight, reset_estimator
-from mjxball.fly.telemetry import WRAP, FirmwareClock
-from mjxball.fly.twin.conditions import DroneFaults, Injection, LinkFaults
-from mjxball.fly.twin.physics import StandIn
-from mjxball.fly.twin.server import HOST, Twin
+from mjxfly import packets
+from mjxfly.connection import REACH, Deadlines, LinkError
+from mjxfly.link import Link
+from mjxfly.packets import Setpoint
+from mjxfly.preflight import Preflight, reset_estimator
+from mjxfly.telemetry import WRAP, FirmwareClock
+from mjxfly.twin.conditions import DroneFaults, Injection, LinkFaults
+from mjxfly.twin.physics import StandIn
+from mjxfly.twin.server import HOST, Twin
 
 pytest.importorskip("cflib")
 pytestmark = pytest.mark.clock  # by the clock

@@ -20,20 +20,20 @@ from wire import pack_state
 
 import onboard as benchmark
 from mjxball import config as configs
-from mjxball.commands import evaluate
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.control.rotations import turned_about_z
 from mjxball.errors import InputError
-from mjxball.fly import packets, recording
-from mjxball.fly.card import mount_angle
-from mjxball.fly.flight_log import STREAMS, Journal, Tail, read
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.log_schema import KINDS, SCHEMA
-from mjxball.fly.packets import DroneState
-from mjxball.fly.recording import SILENCE, load, read_recording
 from mjxball.policy import Policy
-from mjxball.rig import identify
-from mjxball.view.main import main as view
+from mjxfly import packets, recording
+from mjxfly.card import mount_angle
+from mjxfly.flight_log import STREAMS, Journal, Tail, read
+from mjxfly.limits import FlightSettings
+from mjxfly.log import main as draw
+from mjxfly.log_schema import KINDS, SCHEMA
+from mjxfly.packets import DroneState
+from mjxfly.recording import SILENCE, load, read_recording
+from mjxfly.rig import identify
+from mjxfly.view.main import main as view
 
 PRESET = configs.preset("flight")
 HEADER = {"policy": "nobody", "config": configs.to_dict(PRESET), "gains": gains_to_json(pair_gains(PRESET.autopilot))}
@@ -88,7 +88,7 @@ def test_what_is_noted_is_read(tmp_path: Path) -> None:
 def note_calls() -> list[tuple[str, str, set[str], bool]]:
     """(place, kind, fields, whether there may be more) of every record that the package writes, by its syntax."""
     found = []
-    for path in sorted((REPOSITORY / "mjxball").rglob("*.py")):
+    for path in sorted((REPOSITORY / "mjxfly").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call) or not isinstance(node.func, (ast.Attribute, ast.Name)):
                 continue
@@ -255,7 +255,7 @@ def test_every_program_refuses_in_the_same_sentence(name: str, tmp_path: Path, c
     path.write_bytes(b"".join(damage(write(tmp_path / "whole.jsonl", 0.5))))
     said = []
     for main, arguments in (
-        (evaluate.main, ["--flight", path, "--out", tmp_path / "figures"]),
+        (draw, [path, tmp_path / "figures"]),
         (view, [path, "--out", tmp_path / "page.html"]),
         (identify.main, [path, "--out", tmp_path / "plant.json"]),
     ):
@@ -337,7 +337,7 @@ def test_without_a_file_nothing_is_kept() -> None:
 SCRIPT = """
 import json, sys, time
 from pathlib import Path
-from mjxball.fly.flight_log import Journal
+from mjxfly.flight_log import Journal
 log = Journal(Path(sys.argv[1]), policy="nobody", config=json.loads(sys.argv[2]), gains={})
 number = 0
 while True:

@@ -9,7 +9,7 @@ import damage
 import pytest
 from recording_bombs import BOMBS
 
-from mjxball.fly import log_import, log_unpack
+from mjxfly import log_import, log_unpack
 
 for needed in ("lz4.frame", "zstandard", "rosbags"):
     pytest.importorskip(needed)

@@ -7,9 +7,9 @@ import pytest
 from tables import rows
 
 from mjxball.control.rotations import integrate_quaternion
-from mjxball.fly import log_consistency
-from mjxball.fly.log_consistency import TURNING, faults, known, lag, turn, way
-from mjxball.fly.log_sources import Samples
+from mjxfly import log_consistency
+from mjxfly.log_consistency import TURNING, faults, known, lag, turn, way
+from mjxfly.log_sources import Samples
 
 STEP = 0.01  # [s]
 

@@ -17,18 +17,16 @@ from command_line import assert_one_line, call
 from fly_virtual import short_log
 from foreign_logs import NAMES, write_bag, write_cfclient
 
-from mjxball.commands import evaluate
 from mjxball.control.rotations import matrix_from_quaternion, quaternion_from_euler
 from mjxball.errors import InputError
-from mjxball.export import main as export
-from mjxball.fly import flight_log
-from mjxball.fly.log_import import is_recording
-from mjxball.fly.log_schema import Record, StatePacket
-from mjxball.fly.packets import DroneState
-from mjxball.fly.recording import Recording, numbers, read_recording
 from mjxball.plotting import pyplot
-from mjxball.rig import identify
-from mjxball.rig.log import read_log
+from mjxfly import flight_log
+from mjxfly.log import main as export
+from mjxfly.log_schema import Record, StatePacket
+from mjxfly.packets import DroneState
+from mjxfly.recording import Recording, numbers, read_recording
+from mjxfly.rig import identify
+from mjxfly.rig.log import read_log
 
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap_ros2")
@@ -83,10 +81,7 @@ def test_a_bag_of_ours_is_the_log_itself(log: Path, flight: Recording, exported:
 
 @pytest.mark.slow
 def test_its_report_has_the_same_numbers(log: Path, exported: Path, tmp_path: Path, capsys) -> None:
-    reports = [
-        printed(evaluate.main, ["--flight", path, "--out", tmp_path / path.suffix[1:]], capsys)
-        for path in (log, exported)
-    ]
+    reports = [printed(export, [path, tmp_path / path.suffix[1:]], capsys) for path in (log, exported)]
     assert reports[0] == reports[1]
     assert len(reports[0]) > 2
 
@@ -127,7 +122,7 @@ def test_a_figure_has_what_a_recording_has(
         assert "assumed: CG" in figure.legends[0].get_title().get_text()
 
     monkeypatch.setattr(pyplot(), "close", keep)
-    assert call(evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]) == 0
+    assert call(export, [path, tmp_path / "drawn"]) == 0
     monkeypatch.undo()
     pyplot().close("all")
     motion = ["x [m]", "y [m]", "z [m]"]
@@ -515,14 +510,14 @@ def test_bad_input_is_refused_in_one_sentence(
     ]
     for path, reason in cases:
         for main, arguments in (
-            (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+            (export, [path, tmp_path / "drawn"]),
             (identify.main, [path]),
         ):
             assert call(main, arguments) == 2, path
             errors = capsys.readouterr().err
             assert reason in errors, errors
             assert_one_line(errors)
-    assert call(evaluate.main, ["--flight", exported, "--plant", "crazyflie", "--out", tmp_path / "drawn"]) == 2
+    assert call(export, [exported, tmp_path / "drawn", "--plant", "crazyflie"]) == 2
     assert "says which rig flew: drop --plant" in capsys.readouterr().err
     assert not (tmp_path / "drawn").exists()
 
@@ -567,7 +562,7 @@ def test_bags_with_numbers_that_are_none_are_refused(tmp_path: Path, capsys) -> 
 def assert_refused(path: Path, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All that reads a recording says the one sentence `reason`, a regular expression, and writes nothing."""
     for main, arguments in (
-        (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+        (export, [path, tmp_path / "drawn"]),
         (identify.main, [path, "--out", tmp_path / "drawn.json"]),
         (export, [path, tmp_path / "drawn.csv"]),
     ):
@@ -587,13 +582,6 @@ def test_pipes_and_second_recordings_are_refused(records: list[Record], tmp_path
     first = next((twice / "leader").glob("*.csv"))
     shutil.copy(first, first.with_name("again.csv"))
     assert_refused(twice, "in another file of", tmp_path, capsys)
-
-
-def test_a_run_with_a_bag_in_it_is_a_run(tmp_path: Path) -> None:
-    (tmp_path / "flight.mcap").touch()
-    assert is_recording(tmp_path)
-    (tmp_path / "config.json").touch()
-    assert not is_recording(tmp_path)
 
 
 def moved(record: Record) -> DroneState:

@@ -18,8 +18,8 @@ from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environme
 from conftest import too_busy
 from tables import rows
 
-from mjxball.fly import flight_log
-from mjxball.fly.main import main
+from mjxfly import flight_log
+from mjxfly.main import main
 
 pytest.importorskip("cflib")
 URIS = ("--leader", "udp://127.0.0.1:19850", "--follower", "udp://127.0.0.1:19851")
@@ -112,7 +112,7 @@ def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
         "twin.physics",
         "process",
     ]
-    imports = ", ".join(f"mjxball.fly.{name}" for name in modules)
+    imports = ", ".join(f"mjxfly.{name}" for name in modules)
     heavy = ("jax", "jaxlib", "mujoco", "flax", "brax", "cflib")
     script = f"import sys, {imports}; print([name for name in {heavy!r} if name in sys.modules])"
     done = run(["-c", f"import sys; sys.path.insert(0, {str(REPOSITORY)!r}); {script}"], tmp_path)
@@ -121,10 +121,10 @@ def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
 
 def test_a_flight_has_one_clock() -> None:
     """Runner, watchdog and twin of a rehearsal slow down together."""
-    others = {"clock.py", "flight_log.py", "log_export.py", "mocap_child.py"}  # files on disk; cameras, never rehearsed
+    others = {"clock.py", "flight_log.py", "log_export.py", "live.py", "mocap_child.py"}  # of files and cameras
     asked = {
         str(path.relative_to(REPOSITORY))
-        for path in (REPOSITORY / "mjxball/fly").rglob("*.py")
+        for path in (REPOSITORY / "mjxfly").rglob("*.py")
         if path.name not in others and re.search(r"\btime\.(monotonic|perf_counter|sleep)\(", path.read_text("utf-8"))
     }
     assert asked == set()
@@ -154,7 +154,7 @@ def test_a_flight_with_no_name_for_its_log_gets_one(tmp_path: Path) -> None:
             one.bind(("127.0.0.1", 0))
         ports = [one.getsockname()[1] for one in silent]
     uris = ["--leader", f"udp://127.0.0.1:{ports[0]}", "--follower", f"udp://127.0.0.1:{ports[1]}"]
-    done = run(["-m", "mjxball.fly", TRANSPORT, *uris], tmp_path)
+    done = run(["-m", "mjxfly", TRANSPORT, *uris], tmp_path)
     logs = list(tmp_path.iterdir())
     assert (done.returncode, done.stdout) == (2, f"log: {logs[0].name}\n"), done.stderr
     assert next(flight_log.read(logs[0]))["kind"] == "header"
@@ -170,7 +170,7 @@ SIGNALS = {"interrupted": signal.SIGINT, "terminated": signal.SIGTERM}
 
 
 def started(name: str, place: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "mjxball.fly", TRANSPORT, "--rehearse", "--log", f"{name}.jsonl", *KINDS[name]]
+    command = [sys.executable, "-m", "mjxfly", TRANSPORT, "--rehearse", "--log", f"{name}.jsonl", *KINDS[name]]
     surroundings = {**environment(), "PYTHONPATH": str(REPOSITORY)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([str(part) for part in command], cwd=place, env=surroundings, text=True, **pipes)

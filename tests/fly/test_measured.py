@@ -11,20 +11,20 @@ from captured import CapturedTwin
 from tables import rows
 
 from mjxball.control import rotations
-from mjxball.fly import measured, probe
-from mjxball.fly.card import Controller
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.measured import CONTRADICTING, REPEATING, WINDOW, DroneWatch, ImuWatch, Repeats
-from mjxball.fly.mocap_supervision import Frame as PoseFrame
-from mjxball.fly.mocap_supervision import Pose
-from mjxball.fly.packets import DroneState
-from mjxball.fly.supervisor import Event, State
-from mjxball.fly.telemetry import Sample
-from mjxball.fly.twin.conditions import Surroundings
-from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
+from mjxfly import measured, probe
+from mjxfly.card import Controller
+from mjxfly.limits import FlightSettings
+from mjxfly.measured import CONTRADICTING, REPEATING, WINDOW, DroneWatch, ImuWatch, Repeats
+from mjxfly.mocap_supervision import Frame as PoseFrame
+from mjxfly.mocap_supervision import Pose
+from mjxfly.packets import DroneState
+from mjxfly.supervisor import Event, State
+from mjxfly.telemetry import Sample
+from mjxfly.twin.conditions import Surroundings
+from mjxfly.twin.virtual import VirtualTwin
 
 PACKET = 0.02  # [s]
 Parts = tuple[float, ...]

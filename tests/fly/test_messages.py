@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjxball.fly.messages import FIELDS, _moving
+from mjxfly.messages import FIELDS, _moving
 
 OURS = "mjxball_msgs"
 

@@ -20,19 +20,19 @@ from tables import rows
 from vrpn_server import Poses, VrpnServer
 from wire import unpack_pose
 
-from mjxball.fly import mocap as motion_capture
-from mjxball.fly import packets, process
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.link import Link
-from mjxball.fly.main import check_options, main, make_parser, mocap_settings
-from mjxball.fly.mocap import Mocap, MocapError, MocapSettings, ready
-from mjxball.fly.mocap_child import Decimation
-from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose
-from mjxball.fly.packets import Setpoint
-from mjxball.fly.supervisor import Event, State
-from mjxball.fly.telemetry import Rig
-from mjxball.fly.twin.conditions import Surroundings
+from mjxfly.main import check_options, main, make_parser, mocap_settings
 from mjxball.policy import load_file
+from mjxfly import mocap as motion_capture
+from mjxfly import packets, process
+from mjxfly.limits import FlightSettings
+from mjxfly.link import Link
+from mjxfly.mocap import Mocap, MocapError, MocapSettings, ready
+from mjxfly.mocap_child import Decimation
+from mjxfly.mocap_supervision import Frame, MocapLimits, Pose
+from mjxfly.packets import Setpoint
+from mjxfly.supervisor import Event, State
+from mjxfly.telemetry import Rig
+from mjxfly.twin.conditions import Surroundings
 
 pytest.importorskip("cflib")
 pytest.importorskip("motioncapture")
@@ -105,7 +105,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 
     def expect(reason: str) -> None:
         if "does not answer" in reason:
-            monkeypatch.setattr("mjxball.fly.main.ready", functools.partial(ready, limits=MocapLimits(answer=1.0)))
+            monkeypatch.setattr("mjxfly.main.ready", functools.partial(ready, limits=MocapLimits(answer=1.0)))
 
     return expect
 
@@ -251,7 +251,7 @@ class Driver:
 
 
 def test_a_pose_goes_out_only_when_no_setpoint_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mjxball.fly.link.QUIET", 60.0)  # no pings in between
+    monkeypatch.setattr("mjxfly.link.QUIET", 60.0)  # no pings in between
     link, driver = Link("udp://127.0.0.1:1", "leader", lambda kind, **fields: None), Driver()
     link._driver = driver
     link._sender.start()

@@ -17,15 +17,15 @@ from conftest import too_busy
 from vrpn_server import Poses, VrpnServer
 from wire import unpack_pose
 
-from mjxball.fly import packets
-from mjxball.fly.flight_log import read
-from mjxball.fly.limits import NAMES
-from mjxball.fly.process import urgent
-from mjxball.fly.twin.conditions import QUIET, Surroundings
-from mjxball.fly.twin.physics import make_pair
-from mjxball.fly.twin.server import Twin
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
+from mjxfly import packets
+from mjxfly.flight_log import read
+from mjxfly.limits import NAMES
+from mjxfly.process import urgent
+from mjxfly.twin.conditions import QUIET, Surroundings
+from mjxfly.twin.physics import make_pair
+from mjxfly.twin.server import Twin
 
 pytest.importorskip("cflib")
 pytest.importorskip("motioncapture")
@@ -57,7 +57,7 @@ class Flown:
                 return dict(zip(BODIES if follower_is_seen(twin) else BODIES[:1], seen, strict=False))
 
             with VrpnServer(poses, 200.0) as server:
-                command = [sys.executable, "-m", "mjxball.fly", policy, "--seconds", "3", "--log", "log.jsonl"]
+                command = [sys.executable, "-m", "mjxfly", policy, "--seconds", "3", "--log", "log.jsonl"]
                 command += ["--leader", twin.uris[0], "--follower", twin.uris[1]]
                 if captured:
                     command += ["--mocap", "vrpn", "--mocap-host", server.host, "--bodies", *BODIES]

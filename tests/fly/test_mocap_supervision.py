@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire import unpack_pose
 
-from mjxball.fly import packets
-from mjxball.fly.mocap_supervision import (
+from mjxfly import packets
+from mjxfly.mocap_supervision import (
     Frame,
     MocapLimits,
     Pose,
@@ -24,8 +24,8 @@ from mjxball.fly.mocap_supervision import (
     pose_of,
     standing_fault,
 )
-from mjxball.fly.packets import PacketError
-from mjxball.fly.supervisor import Event
+from mjxfly.packets import PacketError
+from mjxfly.supervisor import Event
 
 LIMITS = MocapLimits()
 SPAN = np.array([0.0, 0.3, 0.0])  # leader 0.3 m to the left of the follower, as on the Crazyflie rigs

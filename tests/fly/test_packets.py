@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from wire import pack_state
 
 from mjxball.control import rotations
-from mjxball.fly import packets
-from mjxball.fly.packets import DroneState, PacketError, Setpoint
+from mjxfly import packets
+from mjxfly.packets import DroneState, PacketError, Setpoint
 
 cflib_encoding = pytest.importorskip("cflib.utils.encoding")
 

@@ -6,9 +6,9 @@ import pytest
 
 from mjxball.control.crazyflie import PARAMETERS, Gains, pair_gains
 from mjxball.errors import InputError
-from mjxball.fly.card import Controller, load_policy, variants
-from mjxball.fly.parameters import check_parameters
 from mjxball.policy import Policy, shipped_policy
+from mjxfly.card import Controller, load_policy, variants
+from mjxfly.parameters import check_parameters
 
 
 def refused(name: str, leader: Gains, follower: Gains) -> str:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import pytest
 from tables import rows
 
-from mjxball.fly.connection import READ, Element, LinkError, Parameters
-from mjxball.fly.limits import Limits
-from mjxball.fly.packets import Packet
-from mjxball.fly.positioning import LOCO, UNKNOWN, check, common, found, wait
-from mjxball.fly.twin.positioning import DECKS
+from mjxfly.connection import READ, Element, LinkError, Parameters
+from mjxfly.limits import Limits
+from mjxfly.packets import Packet
+from mjxfly.positioning import LOCO, UNKNOWN, check, common, found, wait
+from mjxfly.twin.positioning import DECKS
 
 
 class Drone:

@@ -15,20 +15,12 @@ from tables import rows
 
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.fly.connection import READ, Deadlines, Element, Identity, LinkError, Parameters, connect
-from mjxball.fly.limits import Limits
-from mjxball.fly.packets import DroneState, Health, Packet, Sensed
-from mjxball.fly.preflight import (
-    Preflight,
-    check_kind,
-    gravity_checks,
-    heading_check,
-    prepare,
-    reset_estimator,
-    stick_check,
-)
-from mjxball.fly.setpoints import CommandMap, Variant
-from mjxball.fly.telemetry import HealthSample, Rig, SensedSample
+from mjxfly.connection import READ, Deadlines, Element, Identity, LinkError, Parameters, connect
+from mjxfly.limits import Limits
+from mjxfly.packets import DroneState, Health, Packet, Sensed
+from mjxfly.preflight import Preflight, check_kind, gravity_checks, heading_check, prepare, reset_estimator, stick_check
+from mjxfly.setpoints import CommandMap, Variant
+from mjxfly.telemetry import HealthSample, Rig, SensedSample
 
 KALMAN, COMPLEMENTARY = 2.0, 1.0
 ASKED = Preflight(reset=0.0, converge=1.0)

@@ -13,19 +13,19 @@ from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
 from mjxball import config as configs
-from mjxball.commands import evaluate
 from mjxball.control import rotations
-from mjxball.fly import card
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.recording import Recording, _tick_remarks, fly_again, read_recording
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.physics import make_pair
 from mjxball.policy import Policy, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
-from mjxball.view.main import main as view
+from mjxfly import card
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.log import main as draw
+from mjxfly.recording import Recording, _tick_remarks, fly_again, read_recording
+from mjxfly.supervisor import State
+from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
+from mjxfly.twin.physics import make_pair
+from mjxfly.view.main import main as view
 
 OLDER = drone_kind(curve="older")  # the motors of the preset
 EXACT = Surroundings(exact=True)  # neither the simulation nor `fly_again` has an estimator
@@ -109,7 +109,7 @@ def test_a_flight_is_what_the_pure_simulation_says(recording: Recording) -> None
 
 
 def test_a_log_is_drawn_and_played(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(evaluate.main, ["--flight", log, "--out", tmp_path / "figures"]) == 0
+    assert call(draw, [log, tmp_path / "figures"]) == 0
     assert "height mm" in capsys.readouterr().out
     assert (tmp_path / "figures" / "flight.png").stat().st_size > 20_000
     assert call(view, [log, "--out", tmp_path / "page.html"]) == 0
@@ -119,15 +119,15 @@ def test_a_log_is_drawn_and_played(log: Path, tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--flight", "log.jsonl"], "--flight needs --out"),
-        (["--flight", "log.jsonl", "--out", "x", "--followers", "copy"], "drop --followers"),
-        (["mine.npz", "--flight", "log.jsonl", "--out", "x"], "drop the policies"),
-        (["--flight", "nowhere.jsonl", "--out", "x"], "cannot be read"),
+        (["nowhere.jsonl", "x"], "cannot be read"),
+        (["log.jsonl", "x.xlsx"], "must end in .mcap, .csv, .parquet"),
+        (["log.jsonl", "x.csv", "--plant", "crazyflie"], "--plant and --style belong to figures"),
+        (["log.jsonl", "x.csv", "--style", "paper"], "--plant and --style belong to figures"),
     ],
 )
 def test_refusals(arguments: list[str], reason: str, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    assert call(evaluate.main, arguments) == 2
+    assert call(draw, arguments) == 2
     errors = capsys.readouterr().err
     assert_one_line(errors)
     assert reason in errors

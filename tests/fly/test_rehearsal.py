@@ -21,11 +21,11 @@ import pytest
 from command_line import REPOSITORY, assert_one_line, environment
 from conftest import too_busy
 
-from mjxball.fly import card
-from mjxball.fly.flight_log import read
-from mjxball.fly.recording import fly_again, read_recording
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
+from mjxfly import card
+from mjxfly.flight_log import read
+from mjxfly.recording import fly_again, read_recording
 
 pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock
@@ -67,7 +67,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Ended]:
 
 def started(name: str, log: Path, *flags: str) -> subprocess.Popen[str]:
     policy = str(shipped_policy(name))
-    command = [sys.executable, "-m", "mjxball.fly", policy, "--rehearse", "--seconds", "3", "--log", str(log), *flags]
+    command = [sys.executable, "-m", "mjxfly", policy, "--rehearse", "--seconds", "3", "--log", str(log), *flags]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     child = {**environment(), "PYTHONPATH": str(REPOSITORY)}
     return subprocess.Popen(command, cwd=log.parent, env=child, text=True, **pipes)
@@ -186,7 +186,7 @@ def test_a_process_that_stands_still_is_a_computer_that_is_too_slow(
         in_air = flies(tmp_path / "stopped.jsonl", process)
         children = descendants(process.pid)
         words = {child: Path(f"/proc/{child}/cmdline").read_text().split("\0") for child in children}
-        twin = next((child for child in children if "mjxball.fly.twin" in words[child]), 0)
+        twin = next((child for child in children if "mjxfly.twin" in words[child]), 0)
         if in_air:
             stopped = twin if who == "twin" else process.pid
             os.kill(stopped, how)

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tables import rows
 
-from mjxball.fly import setpoints
-from mjxball.fly.limits import Times
-from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, PacketError
-from mjxball.fly.setpoints import LINEAR, OLDER, CommandMap, ForceCurve
+from mjxfly import setpoints
+from mjxfly.limits import Times
+from mjxfly.packets import THRUST_CEILING, THRUST_FLOOR, PacketError
+from mjxfly.setpoints import LINEAR, OLDER, CommandMap, ForceCurve
 
 PAPER = CommandMap(law="paper")
 CALIBRATED = CommandMap()

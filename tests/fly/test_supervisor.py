@@ -7,17 +7,7 @@ from collections import deque
 
 from tables import rows
 
-from mjxball.fly.supervisor import (
-    AIRBORNE,
-    ENDED,
-    FAULTS,
-    ON_GROUND,
-    TRANSITIONS,
-    Event,
-    Fault,
-    State,
-    Supervisor,
-)
+from mjxfly.supervisor import AIRBORNE, ENDED, FAULTS, ON_GROUND, TRANSITIONS, Event, Fault, State, Supervisor
 
 PAIRS = list(itertools.product(State, Event))
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from mjxball.control import rotations
-from mjxball.fly.card import Controller, goal_of, limits_of, load_policy
-from mjxball.fly.limits import FlightSettings, Times
-from mjxball.fly.setpoints import CommandMap
-from mjxball.fly.supervisor import Event, State
-from mjxball.fly.takeoff import BEGIN, MOST, TakeOff
-from mjxball.fly.telemetry import ObjectState, Rig
-from mjxball.fly.twin import avionics
-from mjxball.fly.twin.conditions import Conditions, Surroundings
-from mjxball.fly.twin.virtual import VirtualTwin
+from mjxfly.twin import avionics
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.policy.team import is_for_any
+from mjxfly.card import Controller, goal_of, limits_of, load_policy
+from mjxfly.limits import FlightSettings, Times
+from mjxfly.setpoints import CommandMap
+from mjxfly.supervisor import Event, State
+from mjxfly.takeoff import BEGIN, MOST, TakeOff
+from mjxfly.telemetry import ObjectState, Rig
+from mjxfly.twin.conditions import Conditions, Surroundings
+from mjxfly.twin.virtual import VirtualTwin
 
 RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
 PERIOD = 0.01  # [s]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mjxball.errors import InputError
-from mjxball.fly.uri import Radio, Udp, Usb, check_pair, parse_uri, share_dongle
+from mjxfly.uri import Radio, Udp, Usb, check_pair, parse_uri, share_dongle
 
 NUMBERED = "radio://0/80/2M/E7E7E7E7E7"
 

@@ -9,22 +9,22 @@ import pytest
 from command_line import run
 from fly_virtual import VirtualTwin
 
-from mjxball.fly.flight import Flight
-from mjxball.fly.limits import FlightSettings, Times
-from mjxball.fly.supervisor import State
-from mjxball.fly.warm_up import warm_up
+from mjxfly.flight import Flight
+from mjxfly.limits import FlightSettings, Times
+from mjxfly.supervisor import State
+from mjxfly.warm_up import warm_up
 
 # Prints in which states a flight does what only comes once: without and with a warm-up. A process of its own: in this
 # one everything has been loaded.
 FIRST = """
 import json, sys
-from mjxball.fly.card import Controller
-from mjxball.fly.flight import Flight
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.telemetry import Rig
-from mjxball.fly.twin.physics import StandIn, StandInPlant
-from mjxball.fly.twin.virtual import VirtualTwin
-from mjxball.fly.warm_up import warm_up
+from mjxfly.card import Controller
+from mjxfly.flight import Flight
+from mjxfly.limits import FlightSettings
+from mjxfly.telemetry import Rig
+from mjxfly.twin.physics import StandIn, StandInPlant
+from mjxfly.twin.virtual import VirtualTwin
+from mjxfly.warm_up import warm_up
 from mjxball.policy import Policy, shipped_policy
 
 found, ticking = [], False

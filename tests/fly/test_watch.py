@@ -9,13 +9,13 @@ import pytest
 
 from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
-from mjxball.fly import preflight, setpoints
-from mjxball.fly.limits import Limits
-from mjxball.fly.monitor import JUMP, EstimatorWatch, UplinkWatch, stick_faults
-from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
-from mjxball.fly.packets import VARIANCES, DroneState, Health, health_of
-from mjxball.fly.supervisor import Event
-from mjxball.fly.telemetry import Rig, Sample, object_of_one, object_state
+from mjxfly import preflight, setpoints
+from mjxfly.limits import Limits
+from mjxfly.monitor import JUMP, EstimatorWatch, UplinkWatch, stick_faults
+from mjxfly.packets import MOTORS as MOTOR_VARIABLES
+from mjxfly.packets import VARIANCES, DroneState, Health, health_of
+from mjxfly.supervisor import Event
+from mjxfly.telemetry import Rig, Sample, object_of_one, object_state
 
 RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
 WELL = Health((1e-5, 1e-5, 1e-5), (40000,) * 4, 40000.0)

@@ -17,14 +17,14 @@ from command_line import REPOSITORY, TRANSPORT, assert_one_line, environment
 from conftest import too_busy
 from tables import rows
 
-from mjxball.fly import flight_log, packets, watchdog
-from mjxball.fly.process import urgent
-from mjxball.fly.setpoints import SPIN_THRUST, LastKnownState, blind_shares
-from mjxball.fly.twin.drone import TwinDrone
-from mjxball.fly.twin.physics import make_pair
-from mjxball.fly.twin.server import Twin
-from mjxball.fly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed
 from mjxball.policy import load_file
+from mjxfly import flight_log, packets, watchdog
+from mjxfly.process import urgent
+from mjxfly.setpoints import SPIN_THRUST, LastKnownState, blind_shares
+from mjxfly.twin.drone import TwinDrone
+from mjxfly.twin.physics import make_pair
+from mjxfly.twin.server import Twin
+from mjxfly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed
 
 pytest.importorskip("cflib")
 SEEN = LastKnownState((45000, 46000), 0.5, 0.25, -1.0)  # numbers that float32 holds exactly
@@ -200,7 +200,7 @@ def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_pa
             time.sleep(0.01)
         runner.send_signal(number)
 
-    flight = brought_down(flown(tmp_path, lose, ["-m", "mjxball.fly", "--seconds", "60"]))
+    flight = brought_down(flown(tmp_path, lose, ["-m", "mjxfly", "--seconds", "60"]))
     assert flight.code == -signal.SIGKILL
     # The log is whole but for its last moments: every line that was written parses, and the flight is in it.
     assert any(record["kind"] == "tick" and record["state"] == "fly" for record in flight_log.read(flight.log))
@@ -209,9 +209,9 @@ def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_pa
 # At the change to the phase of its first argument the main thread alone stands still, or the program fails.
 SPOILED = """
 import sys, time
-from mjxball.fly import flight
-from mjxball.fly.main import main
-from mjxball.fly.supervisor import Event, Fault, State
+from mjxfly import flight
+from mjxfly.main import main
+from mjxfly.supervisor import Event, Fault, State
 
 phase, how, advance = State(sys.argv[1]), sys.argv[2], flight.Flight._advance
 led = {State.DESCEND: Event.STICK, State.HOLD: Event.UNHEARD}

@@ -284,8 +284,6 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("universal.npz", "a.onnx --plant team4", "--drone must be a follower of --plant: 1, 2, 3"),
         ("universal.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),
         ("universal.npz", "a.onnx --drone 1", "has to be told its team: --plant NAME"),
-        ("universal.npz", "apps --crazyflie --plant team4", "for pairs of Crazyflies, and team4 has 4 drones"),
-        ("universal.npz", "apps --crazyflie --plant pair", "is for another plant than a pair of Crazyflies"),
         ("older.npz", "a.h --plant team4 --drone 1", "has policy format 3, a network on top of an LQG"),
         ("universal.npz", "a.npz --plant nothing", "plant file nothing does not exist"),
     ],

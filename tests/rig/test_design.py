@@ -1,4 +1,4 @@
-"""What `python -m mjxball.rig.design` says of a rig, and the picture."""
+"""What `python -m mjxfly.rig.design` says of a rig, and the picture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from mjxball.cli import plant_setup
 from mjxball.config import cg_limit, replace
 from mjxball.plant.trim import heaviest_object, largest_margin
-from mjxball.rig import design
+from mjxfly.rig import design
 
 
 def test_a_model_is_judged_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -25,8 +25,8 @@ from mjxball.control.margins import (
     worst_margins,
 )
 from mjxball.errors import InputError
-from mjxball.fly.preflight import read_gains
-from mjxball.rig import gains as command
+from mjxfly.preflight import read_gains
+from mjxfly.rig import gains as command
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)

@@ -17,14 +17,14 @@ from mjxball.config import Config, preset, validate
 from mjxball.control import crazyflie, rotations
 from mjxball.control.axes import inertia_about_o
 from mjxball.errors import InputError
-from mjxball.fly.preflight import read_gains
 from mjxball.physics.engine import Load
 from mjxball.physics.step import make_stepper, start_state
 from mjxball.plant import plant_parameters
-from mjxball.rig import identify as command
-from mjxball.rig.fit import Estimate, identify
-from mjxball.rig.gains import parameter_file
-from mjxball.rig.log import make_log, read_log
+from mjxfly.preflight import read_gains
+from mjxfly.rig import identify as command
+from mjxfly.rig.fit import Estimate, identify
+from mjxfly.rig.gains import parameter_file
+from mjxfly.rig.log import make_log, read_log
 
 PAIR = preset("flight")
 PERIOD = PAIR.timing.control_period

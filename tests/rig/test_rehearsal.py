@@ -18,21 +18,21 @@ from mjxball import cli
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control.axes import inertia_about_o
-from mjxball.fly import card
-from mjxball.fly.flight_log import Journal, read
-from mjxball.fly.limits import NAMES, FlightSettings
-from mjxball.fly.recording import load
-from mjxball.fly.setpoints import CurveName
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin import conditions as kinds
-from mjxball.fly.twin.conditions import Conditions
-from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.virtual import STEP
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
-from mjxball.rig import identify as command
-from mjxball.rig.fit import Estimate, identify
-from mjxball.rig.log import Log, read_log
+from mjxfly import card
+from mjxfly.flight_log import Journal, read
+from mjxfly.limits import NAMES, FlightSettings
+from mjxfly.recording import load
+from mjxfly.rig import identify as command
+from mjxfly.rig.fit import Estimate, identify
+from mjxfly.rig.log import Log, read_log
+from mjxfly.setpoints import CurveName
+from mjxfly.supervisor import State
+from mjxfly.twin import conditions as kinds
+from mjxfly.twin.conditions import Conditions
+from mjxfly.twin.coupled import CoupledPair
+from mjxfly.twin.virtual import STEP
 
 CONTENTS = load_file(shipped_policy("flight"))
 CONFIG = card.config_of(CONTENTS.card)

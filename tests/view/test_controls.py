@@ -373,8 +373,7 @@ def test_a_browser_that_cannot_draw_is_told(browser: Any, page: Path) -> None:
 
 def test_marks_survive_in_a_flight_file(flight: Flight, tmp_path: Path) -> None:
     from mjxball.errors import InputError
-    from mjxball.view.flight import load_flight
-    from mjxball.view.marks import Mark
+    from mjxball.view.flight import Mark, load_flight
 
     marked = dataclasses.replace(flight, marks=(Mark(1.0, "phase", "fly", "good"), Mark(2.0, "end", "over", "bad")))
     save_flight(tmp_path / "flight.npz", marked)

@@ -15,13 +15,13 @@ from command_line import assert_one_line, call
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
-from mjxball.fly import flight_log
-from mjxball.fly.display import live_view
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.process import bounded
-from mjxball.view.foxglove import Foxglove
-from mjxball.view.main import main as view
+from mjxfly import flight_log
+from mjxfly.display import live_view
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.view.foxglove import Foxglove
+from mjxfly.view.main import main as view
+from mjxfly.process import bounded
 
 client = pytest.importorskip("websockets.sync.client")
 exceptions = pytest.importorskip("websockets.exceptions")

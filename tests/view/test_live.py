@@ -23,18 +23,19 @@ from conftest import opened
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
-from mjxball.fly.display import live_view
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.main import main as fly
-from mjxball.fly.recording import read_recording
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.physics import make_pair
-from mjxball.view.flight import flight_from
-from mjxball.view.live import LiveView, Server
-from mjxball.view.live_log import COLUMNS, STEP, LiveLog, columns
-from mjxball.view.main import main
+
 from mjxball.view.page import flight_page
+from mjxfly.display import live_view
+from mjxfly.flight_log import Journal
+from mjxfly.limits import FlightSettings
+from mjxfly.main import main as fly
+from mjxfly.recording import read_recording
+from mjxfly.supervisor import State
+from mjxfly.twin.physics import make_pair
+from mjxfly.view.live import LiveView, Server
+from mjxfly.view.live_log import COLUMNS, STEP, LiveLog, columns
+from mjxfly.view.main import main
+from mjxfly.view.recorded import read_log
 
 LIMIT = 20.0  # [s] that anything may take here on a busy machine
 
@@ -88,7 +89,7 @@ def test_a_recorded_log_has_the_marks_of_the_live_view(lines: list[bytes], brows
     """Counted from where the motors turned, in which phase a recording begins; a good end is green in both."""
     path = tmp_path / "log.jsonl"
     path.write_bytes(b"".join(lines))
-    live, recorded = read_all(path).marks, flight_from(str(path), {}, "")
+    live, recorded = read_all(path).marks, read_log(path)
     assert recorded.marks[0].time == pytest.approx(0.0, abs=1e-6)
     assert [mark[1:] for mark in recorded.marks] == [mark[1:] for mark in live[-len(recorded.marks) :]]
     assert [mark.text for mark in recorded.marks[:-1]] == ["spin", "ramp", "fly", "land", "stop", "done"]
@@ -121,7 +122,7 @@ def test_a_fault_is_marked_where_it_happened(lines: list[bytes], browser: Any, t
     path.write_text(
         "".join(json.dumps(one) + "\n" for one in [*records[: flying[-1]], fault, back, *records[flying[-1] : -1], end])
     )
-    live, shown = read_all(path), flight_from(str(path), {}, "")
+    live, shown = read_all(path), read_log(path)
     start = next(one["t"] for one in records if one["kind"] == "tick")
     (mark,) = [one for one in live.marks if one.kind == "fault"]
     assert (mark.time, mark.text) == (pytest.approx(now - start), "stale: <b>follower</b>")
@@ -190,16 +191,20 @@ def test_what_is_no_log_is_refused(contents: bytes, message: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["log.csv"], "is no flight (.npz), flight log (.jsonl)"),
         (["--live", "."], "is no file"),
         (["--live", "nowhere/log.jsonl"], "does not exist"),
         (["--live", "log.jsonl", "--port", "70000"], "--port must be"),
         (["--live", "log.jsonl", "--out", "page.html"], "--live writes no file"),
+        (["--live", "log.jsonl", "--video", "out.gif"], "--live writes no file"),
+        (["--live", "log.jsonl", "more.jsonl"], "--live follows one log"),
         (["log.jsonl", "--port", "8000"], "--port is the port of --live"),
         (["--live", "log.jsonl", "--port", "TAKEN"], "cannot be had"),
     ],
 )
 def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "log.csv").write_text("t,x\n")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert call(main, [port if argument == "TAKEN" else argument for argument in arguments]) == 2
@@ -286,7 +291,7 @@ def test_nothing_but_the_page_and_its_rows_is_served(server: Server) -> None:
 
 def started(path: Path) -> tuple[subprocess.Popen, str]:
     """The command, and its page's address."""
-    command = [sys.executable, "-m", "mjxball.view", "--live", str(path)]
+    command = [sys.executable, "-m", "mjxfly.view", "--live", str(path)]
     surroundings, pipe = {**environment(), "PYTHONPATH": str(REPOSITORY)}, subprocess.PIPE
     process = subprocess.Popen(command, env=surroundings, text=True, stdout=pipe, stderr=pipe)
     line = process.stdout.readline()

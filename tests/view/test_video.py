@@ -80,8 +80,6 @@ def test_videos_that_cannot_be_are_refused(
         (["--out", "page.html", "--speed", "2"], "--speed is of --video"),
         ([flights[1], "--save", "both.npz"], "--save writes one flight"),
         ([flights[1], flights[1]], "two flights fit side by side"),
-        (["--live", "--video", "out.gif"], "--live writes no file"),
-        ([flights[1], "--live"], "--live follows one log"),
     ):
         assert call(main, [flights[0], *arguments]) == 2, words
         errors = capsys.readouterr().err

@@ -15,11 +15,11 @@ from conftest import opened
 
 from mjxball.config import Plant
 from mjxball.errors import InputError
-from mjxball.fly.card import config_of
 from mjxball.policy import load_file, shipped_policy
 from mjxball.view.flight import Flight, check_flight, flight_from, load_flight, save_flight, shapes
 from mjxball.view.main import main
 from mjxball.view.page import flight_page, page_contents, plant_of
+from mjxfly.card import config_of
 
 SECONDS = 4.0
 
@@ -340,8 +340,7 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     [
         (["nobody"], "nobody is no flight"),
         (["nowhere:Law"], "there is no module nowhere"),
-        (["log.csv"], "is no flight (.npz), flight log (.jsonl)"),
-        (["log.jsonl"], "does not begin with a header"),
+        (["log.jsonl"], "mjxfly.view plays flight logs"),
         (["empty"], "has no policy.npz"),
         (["none.npz"], "none.npz does not exist"),
         (["copy", "--out", "page.txt"], "must end in .html"),
@@ -351,7 +350,6 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
 def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
-    (tmp_path / "log.csv").write_text("t,x\n")
     (tmp_path / "log.jsonl").write_text('{"t": 0.0, "kind": "tick"}\n')
     before = listing(tmp_path)
     assert call(main, [arguments[0], *(arguments[1:] or ["--out", "page.html"])]) == 2

@@ -13,11 +13,11 @@ import pytest
 from onboard_bench import AT_REST, Bench, compilers, cores_by, cores_of, needs_gcc, policy_of
 from tables import rows
 
-from mjxball.fly.app.host import App
-from mjxball.fly.app.protocol import CAUSES, Phase
-from mjxball.fly.card import config_of, variants
-from mjxball.fly.telemetry import Rig
 from mjxball.policy.file import law_of
+from mjxfly.app.host import App
+from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.card import config_of, variants
+from mjxfly.telemetry import Rig
 
 WILD = (math.nan, math.inf, -3e38)
 AFTER = {"mount": "the mount is not set, or no length below 1 m", "goal": "the goal is beyond the fence or not finite"}

@@ -11,13 +11,13 @@ import pytest
 from onboard_bench import AT_REST, Bench, cores_of, needs_gcc, policy_of
 
 from mjxball.control import rotations
-from mjxball.fly.app import generate, protocol
-from mjxball.fly.app.host import App
-from mjxball.fly.app.protocol import CAUSES, Phase
-from mjxball.fly.card import Controller
-from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy import Policy
 from mjxball.sim.laws import Laws
+from mjxfly.app import generate, protocol
+from mjxfly.app.host import App
+from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.card import Controller
+from mjxfly.telemetry import ObjectState, Rig
 
 
 @needs_gcc

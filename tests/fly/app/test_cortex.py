@@ -15,11 +15,11 @@ from onboard_bench import Bench, cores_of, needs_gcc, policy_of
 
 import onboard as benchmark
 from mjxball.control import rotations
-from mjxball.export import main as export
-from mjxball.fly.app import generate, protocol
-from mjxball.fly.app.protocol import Phase
-from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy.file import load_file, save_file, shipped_policy
+from mjxfly.app import generate, protocol
+from mjxfly.app.main import main as make_app
+from mjxfly.app.protocol import Phase
+from mjxfly.telemetry import ObjectState, Rig
 
 needs_arm = pytest.mark.skipif(bool(benchmark.missing()), reason=f"not installed: {benchmark.missing()}")
 
@@ -42,7 +42,7 @@ FIRMWARE = (  # its Kbuild's, release 2026.08: gcc's dialect has functions of it
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
     policy, *more = name.removesuffix(" --int8"), *(["--int8"] if name.endswith("--int8") else [])
     save_file(tmp_path / "policy.npz", policy_of(policy))
-    assert call(export, [tmp_path / "policy.npz", tmp_path / "app", "--crazyflie", *more]) == 0
+    assert call(make_app, [tmp_path / "policy.npz", tmp_path / "app", *more]) == 0
     glue = (tmp_path / "app/src/glue.c").read_text()
     (tmp_path / "include").mkdir()
     for header in set(re.findall(r'#include "(\w+\.h)"', glue)) - {"core.h"}:

@@ -15,19 +15,20 @@ from onboard_bench import Bench, needs_gcc, policy_of
 import onboard as benchmark
 from mjxball.errors import InputError
 from mjxball.export import main as export
-from mjxball.fly.app import generate, protocol
-from mjxball.fly.app.host import App, compile_pair
-from mjxball.fly.app.protocol import CAUSES, Phase
-from mjxball.fly.app_flight import Apps, send_weights
-from mjxball.fly.connection import LinkError
-from mjxball.fly.limits import NAMES
-from mjxball.fly.main import main as fly
-from mjxball.fly.packets import Packet
-from mjxball.fly.telemetry import Rig
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.policy.quantize import balanced, quantized
+from mjxfly.app import generate, protocol
+from mjxfly.app.host import App, compile_pair
+from mjxfly.app.main import main as make_app
+from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app_flight import Apps, send_weights
+from mjxfly.connection import LinkError
+from mjxfly.limits import NAMES
+from mjxfly.main import main as fly
+from mjxfly.packets import Packet
+from mjxfly.telemetry import Rig
 
 
 def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -42,13 +43,16 @@ def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 
 def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.CaptureFixture):
-    for arguments, text in (
-        ([shipped_policy("balance"), tmp_path / "app", "--crazyflie"], "another plant than a pair of Crazyflies"),
-        ([shipped_policy("flight"), tmp_path, "--crazyflie"], "exists"),
-        ([shipped_policy("flight"), tmp_path / "a" / "b", "--crazyflie"], "does not exist"),
-        (["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
+    universal, place = shipped_policy("universal"), tmp_path / "app"
+    for main, arguments, text in (
+        (make_app, [shipped_policy("balance"), place], "another plant than a pair of Crazyflies"),
+        (make_app, [universal, place, "--plant", "team4"], "for pairs of Crazyflies, and team4 has 4 drones"),
+        (make_app, [universal, place, "--plant", "pair"], "is for another plant than a pair of Crazyflies"),
+        (make_app, [shipped_policy("flight"), tmp_path], "exists"),
+        (make_app, [shipped_policy("flight"), tmp_path / "a" / "b"], "does not exist"),
+        (export, ["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
     ):
-        assert call(export, arguments) == 2, text
+        assert call(main, arguments) == 2, text
         error = capsys.readouterr().err
         assert_one_line(error)
         assert text in error

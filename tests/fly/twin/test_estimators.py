@@ -12,19 +12,12 @@ from twin_peer import written
 from mjxball import config as configs
 from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import pair_gains
-from mjxball.fly.twin.conditions import (
-    DELIVERED,
-    Battery,
-    Conditions,
-    DroneKind,
-    Surroundings,
-    drone_kind,
-)
-from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.drone import TwinDrone
-from mjxball.fly.twin.estimators import Imu
-from mjxball.fly.twin.pair import Modes, PairState
-from mjxball.fly.twin.protocol import header
+from mjxfly.twin.conditions import DELIVERED, Battery, Conditions, DroneKind, Surroundings, drone_kind
+from mjxfly.twin.coupled import CoupledPair
+from mjxfly.twin.drone import TwinDrone
+from mjxfly.twin.estimators import Imu
+from mjxfly.twin.pair import Modes, PairState
+from mjxfly.twin.protocol import header
 
 TICK = 0.005  # [s]
 RISING = 51000.0  # [thrust units] 1 % above what hovers: 4 x 0.12 N for half of 75.5 g

@@ -9,11 +9,11 @@ import struct
 import pytest
 from twin_peer import ask, written
 
-from mjxball.fly import packets
-from mjxball.fly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
-from mjxball.fly.twin import logs
-from mjxball.fly.twin.arming import PERIOD, Phase
-from mjxball.fly.twin.conditions import (
+from mjxfly import packets
+from mjxfly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
+from mjxfly.twin import logs
+from mjxfly.twin.arming import PERIOD, Phase
+from mjxfly.twin.conditions import (
     DELIVERED,
     DRONES,
     FAULT_KINDS,
@@ -23,11 +23,11 @@ from mjxball.fly.twin.conditions import (
     LinkFaults,
     Surroundings,
 )
-from mjxball.fly.twin.drone import TwinDrone, advance
-from mjxball.fly.twin.firmware import BOOT_TIME, Firmware, Motors, Order
-from mjxball.fly.twin.parameters import PARAMETERS
-from mjxball.fly.twin.physics import StandIn
-from mjxball.fly.twin.protocol import Peer, header
+from mjxfly.twin.drone import TwinDrone, advance
+from mjxfly.twin.firmware import BOOT_TIME, Firmware, Motors, Order
+from mjxfly.twin.parameters import PARAMETERS
+from mjxfly.twin.physics import StandIn
+from mjxfly.twin.protocol import Peer, header
 
 BRUSHLESS = DRONES["brushless"]
 HIGH = Setpoint(8.0, -5.0, 10.0, 45000)

@@ -10,10 +10,10 @@ import pytest
 from command_line import TRANSPORT, assert_one_line, call
 
 from mjxball import config as configs
-from mjxball.fly.main import main
-from mjxball.fly.twin.conditions import AddedLoad, Surroundings
-from mjxball.fly.twin.coupled import CoupledPair, grounded_model, put_on
 from mjxball.policy import shipped_policy
+from mjxfly.main import main
+from mjxfly.twin.conditions import AddedLoad, Surroundings
+from mjxfly.twin.coupled import CoupledPair, grounded_model, put_on
 
 REFUSALS = [
     (TRANSPORT, "0.004 0.05 5", "trained on Crazyflies"),

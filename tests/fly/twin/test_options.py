@@ -7,16 +7,8 @@ import argparse
 import pytest
 
 from mjxball.errors import InputError
-from mjxball.fly.main import check_twin_options, make_parser, twin_options
-from mjxball.fly.twin.conditions import (
-    CURVES,
-    DRONES,
-    OLDER_FORCE,
-    Surroundings,
-    add_twin_options,
-    drone_kind,
-    surroundings,
-)
+from mjxfly.main import check_twin_options, make_parser, twin_options
+from mjxfly.twin.conditions import CURVES, DRONES, OLDER_FORCE, Surroundings, add_twin_options, drone_kind, surroundings
 
 ASKED = "--twin-drone brushless --twin-curve older --twin-noise 3 --twin-pose-hz 20 --twin-deck no --twin-delay 0.01"
 ASKED += " --twin-gains 0.95 1.05 --twin-seed 7"

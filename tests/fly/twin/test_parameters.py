@@ -12,23 +12,23 @@ from twin_peer import written
 
 from fly_faults_virtual import SETTLE, settings_of
 from mjxball import config as configs
-from mjxball.fly import session
-from mjxball.fly.app.protocol import CAUSES, CONTROLLER, GROUP, LOGGED
-from mjxball.fly.app_flight import check_ready
-from mjxball.fly.connection import LinkError
-from mjxball.fly.link import Link
-from mjxball.fly.main import main as fly
-from mjxball.fly.mocap import Mocap, MocapSettings
-from mjxball.fly.twin import virtual
-from mjxball.fly.twin.conditions import DELIVERED, DRONES, POSITIONING, Conditions, Surroundings
-from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.drone import ACTED, TwinDrone, only_kept
-from mjxball.fly.twin.firmware import Motors
-from mjxball.fly.twin.logs import GROUPS, LOG_VARIABLES
-from mjxball.fly.twin.parameters import OF_APP, PARAMETERS
-from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
+from mjxfly import session
+from mjxfly.app.protocol import CAUSES, CONTROLLER, GROUP, LOGGED
+from mjxfly.app_flight import check_ready
+from mjxfly.connection import LinkError
+from mjxfly.link import Link
+from mjxfly.main import main as fly
+from mjxfly.mocap import Mocap, MocapSettings
+from mjxfly.twin import virtual
+from mjxfly.twin.conditions import DELIVERED, DRONES, POSITIONING, Conditions, Surroundings
+from mjxfly.twin.coupled import CoupledPair
+from mjxfly.twin.drone import ACTED, TwinDrone, only_kept
+from mjxfly.twin.firmware import Motors
+from mjxfly.twin.logs import GROUPS, LOG_VARIABLES
+from mjxfly.twin.parameters import OF_APP, PARAMETERS
+from mjxfly.twin.virtual import VirtualTwin
 
 
 def drone_with(kind: Any = DELIVERED, **around: Any) -> TwinDrone:

@@ -9,11 +9,11 @@ import pytest
 
 from mjxball import config as configs
 from mjxball.errors import InputError
-from mjxball.fly.positioning import system_of
-from mjxball.fly.twin.conditions import DELIVERED, Conditions, Surroundings, add_twin_options, surroundings
-from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.drone import TwinDrone
-from mjxball.fly.twin.positioning import Lighthouse, Loco
+from mjxfly.positioning import system_of
+from mjxfly.twin.conditions import DELIVERED, Conditions, Surroundings, add_twin_options, surroundings
+from mjxfly.twin.coupled import CoupledPair
+from mjxfly.twin.drone import TwinDrone
+from mjxfly.twin.positioning import Lighthouse, Loco
 
 TICK = 0.005  # [s]
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from mjxball.control import rotations
-from mjxball.fly import packets
-from mjxball.fly.packets import Setpoint
-from mjxball.fly.process import wait_until
-from mjxball.fly.twin import logs, protocol
-from mjxball.fly.twin.pair import RUNNING, Modes, PairState
-from mjxball.fly.twin.parameters import PARAMETERS
-from mjxball.fly.twin.physics import StandIn
-from mjxball.fly.twin.server import HOST, MOST_BEHIND, Twin
+from mjxfly import packets
+from mjxfly.packets import Setpoint
+from mjxfly.process import wait_until
+from mjxfly.twin import logs, protocol
+from mjxfly.twin.pair import RUNNING, Modes, PairState
+from mjxfly.twin.parameters import PARAMETERS
+from mjxfly.twin.physics import StandIn
+from mjxfly.twin.server import HOST, MOST_BEHIND, Twin
 
 cflib = pytest.importorskip("cflib")
 pytestmark = pytest.mark.clock  # by the clock

@@ -9,14 +9,14 @@ import pytest
 from fly_policies import untrained
 
 from mjxball import config as configs
-from mjxball.fly import packets
-from mjxball.fly.card import Controller, goal_of, variants
-from mjxball.fly.limits import FlightSettings
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
+from mjxfly import packets
+from mjxfly.card import Controller, goal_of, variants
+from mjxfly.limits import FlightSettings
+from mjxfly.supervisor import State
+from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
+from mjxfly.twin.virtual import VirtualTwin
 
 pytest.importorskip("mujoco")
 

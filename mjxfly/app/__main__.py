@@ -1,0 +1,10 @@
+"""`python -m mjxfly.app`."""
+
+import sys
+
+from mjxball.cli import quit_on_interrupt
+from mjxfly.app.main import main
+
+if __name__ == "__main__":
+    quit_on_interrupt()  # there is nothing to save
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""What laptop and apps say to each other: phases, causes, packets of the app channel, parameters and log variables."""
+
+from __future__ import annotations
+
+import enum
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from mjxfly.packets import Packet
+
+PORT, CHANNEL = 13, 2  # the firmware's channel for apps
+BEAT_SIZE, REPLY_SIZE = 40, 8
+CHUNK = 24  # bytes of weights in a packet
+GROUP = "mjxb"
+CONTROLLER, PID, OUT_OF_TREE = "stabilizer.controller", 1, 6  # the firmware hands an app the state as the last alone
+# Names behind the group, with their types, in the order of glue.c; read-only ones are marked.
+PARAMETERS = (
+    *((f"{what}{axis}", "float", False) for what in ("goal", "mount") for axis in "XYZ"),
+    ("curve", "uint8_t", False),
+    ("battery", "float", False),
+    ("ident", "uint32_t", True),
+    ("role", "uint8_t", True),
+    ("period", "uint8_t", True),
+)
+LOGGED = (
+    *((name, "uint8_t") for name in ("phase", "cause", "refusal", "copying")),
+    ("late", "float"),
+    *((name, "uint32_t") for name in ("used", "laptopAge", "peerAge")),
+    *((name, "float") for name in ("roll", "pitch", "az", "thrust")),
+)
+
+
+class Phase(enum.IntEnum):
+    """`mjxball_phase`: where an app is, and what the laptop asks it for."""
+
+    IDLE = 0
+    SPIN = 1
+    RAMP = 2
+    FLY = 3
+    LAND = 4
+    DESCEND = 5
+    STOP = 6
+
+
+CANNOT_FLY = "the firmware cannot fly"
+# The sentence of every `mjxball_cause`, in its order.
+CAUSES = (
+    "good",
+    "asked for by the laptop",
+    "the other drone does",
+    "the laptop is not heard",
+    "the other drone is not heard",
+    "the other drone flies another policy",
+    "the mount is not set, or no length below 1 m",
+    "the goal is beyond the fence or not finite",
+    "the policy does not fly with this force curve",
+    "the state is old or not finite",
+    "the command is not finite",
+    "the estimator's position cannot be trusted",
+    "beyond the fence",
+    "tilted beyond the limit",
+    CANNOT_FLY,
+    "thrust at its bound for too long",
+    "the law comes late",
+    "the phase lasted too long",
+    "on the ground",
+    "weights refused: wrong rate, plant, layers, size or CRC",
+    "refused: weights, mount and curve change on the ground only",
+    "the battery is low",
+    "the limit of the battery is not between 0 and 10 V",
+)
+
+
+def reason(cause: int) -> str:
+    """The sentence of a cause."""
+    return CAUSES[cause] if 0 <= cause < len(CAUSES) else "unknown"
+
+
+class AppSample(NamedTuple):
+    """What an app logs about itself, as it arrived."""
+
+    phase: Phase
+    cause: int
+    refusal: int
+    copying: bool
+    arrival: float  # [s] of our monotonic clock
+
+
+APP_VARIABLES = tuple((f"{GROUP}.{name}", "uint8_t") for name in ("phase", "cause", "refusal", "copying"))
+
+
+def sample_of(values: Mapping[str, float], arrival: float) -> AppSample | None:
+    """An app's log packet by name; None for a phase that there is not."""
+    phase, cause, refusal, copying = (int(values[name]) for name, _ in APP_VARIABLES)
+    known = phase <= max(Phase)
+    return AppSample(Phase(phase), cause, refusal, bool(copying), arrival) if known else None
+
+
+def order(phase: Phase) -> Packet:
+    """The laptop's heartbeat: which phase it wants."""
+    return Packet(PORT, CHANNEL, bytes([1, phase]))
+
+
+def upload(weights: bytes, key: int) -> Iterator[Packet]:
+    """Packets that put `weights` into a follower that has everything else in common; each is answered."""
+    yield Packet(PORT, CHANNEL, struct.pack("<BIII", 2, key, len(weights), zlib.crc32(weights)))
+    for at in range(0, len(weights), CHUNK):
+        yield Packet(PORT, CHANNEL, struct.pack("<BI", 3, at) + weights[at : at + CHUNK])
+    yield Packet(PORT, CHANNEL, bytes([4]))
+
+
+class Reply(NamedTuple):
+    """The answer to a packet of an upload."""
+
+    kind: int
+    status: int  # a cause; 0: good
+    received: int  # bytes so far
+
+
+def reply_of(data: bytes) -> Reply | None:
+    """The reply in the payload of a packet of the app channel; None if it is none."""
+    return Reply(*struct.unpack("<BBxxI", data)) if len(data) == REPLY_SIZE else None

@@ -1,0 +1,190 @@
+"""What a policy's card says about how it is flown: configuration, gains, command maps, goal; and its two laws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.cli import plant_setup
+from mjxball.config import Config
+from mjxball.control import crazyflie, motors, rotations
+from mjxball.control.crazyflie import PairGains
+from mjxball.control.motors import MOTORS, Motor
+from mjxball.policy import Policy, PolicyFile, load_file, team
+from mjxball.sim.laws import Body, Laws
+from mjxfly.limits import Limits, Times
+from mjxfly.setpoints import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
+from mjxfly.telemetry import Rig
+
+GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
+STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
+LOW_BATTERY = {"brushless": 3.35}  # [V], where it is not that of `Limits`
+UNKNOWN_MASS = 0.07  # of all that flies, where the card's plant is not a pair of Crazyflies [kg]
+
+
+def load_policy(path: Path) -> PolicyFile:
+    """The policy in the file `path`, one for any rig told that it flies two Crazyflies. Raises PolicyFileError."""
+    contents = load_file(path)
+    if not team.is_for_any(contents.card):
+        return contents
+    return team.in_team(contents, path.stem, plant_setup(team.CRAZYFLIES))
+
+
+def config_of(card: Mapping[str, Any]) -> Config:
+    """The configuration that a policy was trained with; what older files did not record has its default.
+
+    Raises InputError if the card's configuration is none.
+    """
+    data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
+    data["plant"] = {**data["plant"], **configs.with_current_names({"plant": card["plant"]})["plant"]}
+    tilt, vertical = card["command_limits"]
+    data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"]}
+    data["command"] |= {"tilt_limit": tilt, "vertical_limit": vertical}
+    data["timing"] |= {"control_period": card["control_period"]}
+    return configs.validate(configs.from_record(data))
+
+
+def mount_angle(card: Mapping[str, Any]) -> float:
+    """Angle about body z by which the axes are turned in which the policy sees and commands [rad], see `team`."""
+    return float(card.get("team", {}).get("mount_angle", 0.0))
+
+
+def is_crazyflie(config: Config) -> bool:
+    """True if the policy was trained on a pair of Crazyflies."""
+    return config.autopilot.kind == "crazyflie"
+
+
+def gains_of(config: Config) -> PairGains:
+    """Firmware parameters that make both cascades those that the policy was trained with; none for others."""
+    if not is_crazyflie(config):
+        return {}, {}
+    return crazyflie.pair_gains(config.autopilot)
+
+
+def goal_of(config: Config) -> tuple[float, float, float]:
+    """Default goal of O, from where it stands at the start [m]."""
+    return GOAL if config.plant.stand == "free" else STAND_GOAL
+
+
+def times_of(config: Config) -> Times:
+    """How long the flight's states last: the paper's thrust law follows its goal down too weakly to wait for it."""
+    return Times(land_spare=0.0) if config.autopilot.thrust_law == "paper" else Times()
+
+
+def limits_of(config: Config, goal: Sequence[float], battery: float | None = None) -> Limits:
+    """Bounds of a flight to `goal` [m]; `battery` [V]: land below it, None for what suits the drones."""
+    bounds = Limits()
+    bounds = replace(bounds, battery=battery or LOW_BATTERY.get(drone_of(config), bounds.battery))
+    return bounds if config.plant.stand == "free" else bounds.on_stand(goal[2])
+
+
+@dataclass(frozen=True)
+class ThrustChoice:
+    """What the command line says about thrust; None: as the card has it."""
+
+    law: Literal["paper", "calibrated"] | None = None
+    hover: float | None = None  # [thrust units]
+    curve: CurveName | None = None
+    mass: float | None = None  # of all that flies [kg]
+
+
+def drone_of(config: Config) -> str:
+    """Which Crazyflie the policy was trained for, a key of `motors.MOTORS`."""
+    return str(motors.firmware(config)["drone"])
+
+
+def motor_of(config: Config) -> Motor:
+    """The motor by which a firmware's force curve is recognised."""
+    return MOTORS[drone_of(config)]
+
+
+def curve_of(config: Config, name: CurveName) -> ForceCurve:
+    """Force of a motor from the thrust command, by a firmware with (`linear`) or without battery compensation."""
+    return ForceCurve(0.0, motor_of(config).max_force) if name == "linear" else OLDER
+
+
+def with_curve(config: Config, name: CurveName) -> Config:
+    """`config` for firmwares of the named force curve, see `motors.with_curve`; others' plants stay."""
+    if not is_crazyflie(config) or name == motors.firmware(config)["curve"]:
+        return config
+    curve = curve_of(config, name)
+    return motors.with_curve(config, (curve.quadratic, curve.linear))
+
+
+def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGains = ({}, {})) -> list[Variants]:
+    """How leader and follower are flown, by the force curve that their firmware may have.
+
+    `choice.curve` leaves one; `more` gains are laid over the card's, whichever the curve.
+    """
+    known = motors.firmware(config)
+    possible = (known["curve"], *known["converts"]) if choice.curve is None else (choice.curve,)
+    names = [name for name in CURVE_NAMES if name in possible]
+    found: list[dict[CurveName, Variant]] = [{}, {}]
+    for name in names:
+        own = with_curve(config, name)
+        maps, gains = command_maps(own, replace(choice, curve=name)), gains_of(own)
+        for number in range(2):
+            found[number][name] = Variant(maps[number], {**gains[number], **more[number]})
+    return list(found)
+
+
+def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple[CommandMap, CommandMap]:
+    """Command maps of leader and follower: each carries itself and its share of the object, as in simulation."""
+    plant, autopilot = config.plant, config.autopilot
+    known = is_crazyflie(config)
+    shares = Rig.of_plant(plant).weights
+    curve = ForceCurve(*autopilot.motor_curve) if known else curve_of(config, choice.curve or "linear")
+    hover = autopilot.hover_thrust if choice.hover is None else choice.hover
+    law = choice.law or (autopilot.thrust_law if known else "calibrated")
+    own = plant.known_masses
+    carried = [mass + share * plant.object_mass for mass, share in zip(own, shares, strict=True)]
+    if choice.mass is not None or not known:
+        whole = UNKNOWN_MASS if choice.mass is None else choice.mass
+        # Without a plant that can be trusted, all masses scale alike.
+        carried = [mass * whole / sum(carried) for mass in carried] if known else [share * whole for share in shares]
+    per_acceleration = autopilot.thrust_per_acceleration
+    leader, follower = (CommandMap(law, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried)
+    return leader, follower
+
+
+class Commands(NamedTuple):
+    """What both laws want at one tick."""
+
+    leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
+    follower: np.ndarray  # (3,) likewise
+    observation: np.ndarray  # (18,) what the follower saw
+    hidden: np.ndarray | None = None  # (H,) state of its GRU after that; None: it has none
+
+
+class Controller:
+    """Leader and follower at the policy's own rate, by the loop, gains and limits in the policy's card."""
+
+    def __init__(self, policy: Policy):
+        config = config_of(policy.card)
+        self.policy, self.config, self.period = policy, config, policy.control_period
+        self._loop, self._angle = Laws(config), mount_angle(policy.card)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a flight: no integral, no memory."""
+        self._integral = self._loop.zero_integral(np.zeros(3))
+        self.policy.reset()
+
+    @property
+    def integral(self) -> np.ndarray:
+        """What both laws have integrated, see `sim.laws.Laws`."""
+        return self._integral
+
+    def step(self, state: Body, goal: np.ndarray) -> Commands:
+        """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
+        seen = self._loop.observe(state, goal)
+        led = self._loop.leader_command(state, goal, self._integral)
+        answer = np.asarray(self.policy(rotations.turned_about_z(seen, -self._angle)), float)
+        followed = self._loop.follower_command(rotations.turned_about_z(answer, self._angle), self._integral)
+        self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
+        return Commands(led, followed, seen, self.policy.hidden)

@@ -1,0 +1,404 @@
+"""One flight, tick by tick: states in, faults to the supervisor, setpoints out to both drones. No clock, no thread."""
+
+from __future__ import annotations
+
+import collections
+import math
+import operator
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mjxfly import packets, probe, setpoints
+from mjxfly.card import Commands, Controller
+from mjxfly.display import View
+from mjxfly.ending import Ending
+from mjxfly.figures import Flown
+from mjxfly.lift import LiftWatch
+from mjxfly.limits import FlightSettings
+from mjxfly.mocap import Mocap
+from mjxfly.monitor import Monitor, Sustained, UplinkWatch, link_faults, tilt_angle
+from mjxfly.packets import ZERO, PacketError, Setpoint
+from mjxfly.preflight import SpinCheck
+from mjxfly.setpoints import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
+from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State, Supervisor
+from mjxfly.takeoff import TakeOff
+from mjxfly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
+from mjxfly.watchdog import Watchdog
+
+HIDDEN_DECIMALS = 4  # of a GRU's state in the log, 50 times a second
+LIFTED = 0.05  # [m], or half of the goal's height if that is less, from which on a pair counts as having flown
+
+
+class Flight:
+    """See the module. `tick` is called once per period until it returns false."""
+
+    def __init__(
+        self,
+        links: Sequence[DroneLink],
+        controller: Controller,
+        variants: Sequence[Variants],
+        assumed: Sequence[CurveName],
+        rig: Rig,
+        settings: FlightSettings,
+        note: Note,
+        watchdog: Watchdog | None = None,
+        mocap: Mocap | None = None,
+    ):
+        """`variants` of leader and follower by force curve; `assumed` are the curves whose gains were uploaded."""
+        self.links, self.controller, self.rig, self.settings = links, controller, rig, settings
+        self.note, self.watchdog, self._mocap = note, watchdog, mocap
+        self.flown = Flown()
+        self.supervisor = Supervisor()
+        self.interrupts, self.kill = 0, False
+        self.ready: bool | None = None  # checks before flight: not known yet, passed, failed
+        self.refusal = ""
+        self.excuse: Callable[[Fault], Exception | None] = lambda cause: None  # for a fault that is this computer's
+        self.view: View | None = None
+        self.spin = SpinCheck(links, variants, assumed, settings.motor)
+        self.highest = [0, 0]  # thrust of each drone that was wanted [units]
+        self._sent: list[Setpoint] = [ZERO, ZERO]
+        self._needed = (1.0, 1.0)  # force of leader and follower by which they hover level, of what the card says
+        self._trims = [0.0, 0.0]  # thrust that hovers [units]: a running average of what was sent
+        self._commands: Commands | None = None
+        self._every = max(round(controller.period / settings.period), 1)  # ticks per command
+        self._count = 0
+        self._monitor = Monitor(rig, settings)
+        self._lift = LiftWatch(settings.motor)
+        self.ending = Ending(settings, self._lifts_at)
+        self._saturated = Sustained(settings.limits.saturation_time)
+        self._back = Sustained(settings.limits.fresh)
+        self._holds = 0
+        self._hold_for = settings.times.drone_watchdog
+        self._descend_for = settings.times.descent_limit(settings.goal[2])
+        self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
+        self._land_height = 0.0
+        self._heights = collections.deque([math.inf], round(settings.times.rest / settings.period) + 1)  # of O [m]
+        self._highest_place = 0.0  # of O above where it stood, under the laws [m]
+        self._take_off = TakeOff(rig, settings.times, settings.period, self._lifts_at, settings.stand)
+
+    @property
+    def maps(self) -> tuple[CommandMap, CommandMap]:
+        """Command maps of leader and follower for their firmwares' force curves, and for what the take-off found."""
+        leader, follower = (own.map.scaled(s) for own, s in zip(self.spin.chosen(), self._needed, strict=True))
+        return leader, follower
+
+    @property
+    def lifted(self) -> bool:
+        """True if the pair left the ground, or was not to."""
+        return self._highest_place >= self._lifts_at
+
+    @property
+    def flying(self) -> bool:
+        """True while the pair may be in the air."""
+        return self.supervisor.state in AIRBORNE and not self.settings.dry_run
+
+    @property
+    def _lifts_at(self) -> float:
+        highest = LIFTED if self._mocap is None else probe.LIFTED
+        return min(highest, self.settings.goal[2] / 2)
+
+    @property
+    def elapsed(self) -> float:
+        """Time in the supervisor's present state [s]."""
+        return self._now - self.supervisor.since
+
+    def begin(self, now: float) -> None:
+        """Where the pair stands now is where it starts; both links must have a state."""
+        self._read(now)
+        self._start, self._monitor.origin = now, object_state(self._states, self.rig).position
+        self.supervisor = Supervisor(State.CHECK, now)
+
+    def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
+        """Everything that happens in one period; false once the flight is done.
+
+        `late` [s] is this tick's, `missed` the deadlines missed within the last second, `gap` [s] the time since the
+        tick before.
+        """
+        self._read(now)
+        faults = self._from_outside(missed, gap)
+        faults += self._monitor.update(self.supervisor.state, self.links, self._ages, now)
+        if self._mocap is not None and any(fault.event is Event.FRAME for fault in faults):
+            self._mocap.halt()
+        self._heights.append(self._height(self._object()))
+        mapped, broken = self._command()
+        self._advance(faults + broken + self._progress())
+        self._note_ending(faults + broken, gap)
+        wanted = self._wanted(mapped)
+        self._transmit(wanted)
+        self._record(wanted, late, missed)
+        self._count += 1
+        return self.supervisor.state is not State.DONE
+
+    def _note_ending(self, faults: list[Fault], gap: float) -> None:
+        self.ending.update(faults, self.supervisor, self._now, gap)
+        if any(self._fresh) and self.supervisor.state not in ON_GROUND:
+            seen = self._object()
+            place, climb = seen.position - self._monitor.origin, float(seen.velocity[2])
+            self.ending.touchdown.update(place, climb, self._now, self._doubt())
+
+    def _doubt(self) -> str:
+        """Why what is known of the pair is no fact, empty if it is."""
+        fresh = [state for state, known in zip(self._states, self._fresh, strict=True) if known]
+        if not all(tilt_angle(state.quaternion) <= self.settings.limits.tilt for state in fresh):
+            return "it turned over"
+        estimators = self._monitor.estimators
+        believed = any(estimators.trusted) and not estimators.contradiction
+        return "" if believed else "no estimator is believed"
+
+    def how_it_ended(self) -> list[str]:
+        """Why, and how the pair came down, a sentence each."""
+        return self.ending.sentences(self.supervisor, self._start, asked=self.interrupts > 0)
+
+    def _read(self, now: float) -> None:
+        self._now = now
+        self._states = [link.telemetry.newest.state for link in self.links if link.telemetry.newest is not None]
+        self._ages = [link.telemetry.age(now) for link in self.links]
+        self._fresh = [age <= self.settings.limits.state_age for age in self._ages]
+
+    # What is wrong.
+
+    def _from_outside(self, missed: int, gap: float) -> list[Fault]:
+        """What user, links, loop, cameras and watchdog say."""
+        bounds, faults = self.settings.limits, []
+        if self.kill or self.interrupts > 1:
+            faults.append(Fault(Event.KEY_KILL, "asked for on the laptop"))
+        elif self.interrupts:
+            faults.append(Fault(Event.INTERRUPT, "asked for on the laptop"))
+        # Time in which this computer did nothing says nothing of the links.
+        idle = max(gap - self.settings.period, 0.0)
+        faults += link_faults(self.links, [age - idle for age in self._ages], bounds, self._now - idle)
+        if self._holds > bounds.gaps:
+            faults.append(Fault(Event.GAPS, f"{self._holds} times"))
+        if missed > bounds.missed_deadlines or gap > bounds.longest_gap:
+            faults.append(Fault(Event.DEADLINES, f"{missed} missed in a second, longest gap {1000 * gap:.0f} ms"))
+        if self._mocap is not None:
+            faults += self._mocap.faults(self._now)
+        if self.flying and all(self._fresh):
+            volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
+            faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
+        # Also on the ground once motors turn: the tick that begins the ramp may stand still before the next beat.
+        guarded = self.flying or (self.supervisor.state is State.SPIN and not self.settings.dry_run)
+        if self.watchdog is not None and not self.watchdog.beat(guarded, self._last_known_state()):
+            faults.append(Fault(Event.WATCHDOG))
+        return faults
+
+    # What is known of the pair.
+
+    def _object(self) -> ObjectState:
+        return self._monitor.object or object_state(self._states, self.rig)
+
+    def _height(self, seen: ObjectState) -> float:
+        """Of O above where it stood [m]."""
+        return float(seen.position[2] - self._monitor.origin[2])
+
+    def _last_known_state(self) -> LastKnownState:
+        seen, trim = self._object(), sum(self._trims)
+        lift = setpoints.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
+        trims = (round(self._trims[0]), round(self._trims[1]))
+        return LastKnownState(trims, self._height(seen), float(seen.velocity[2]), lift)
+
+    def _trusted(self) -> ObjectState | None:
+        return self._monitor.object if any(self._monitor.estimators.trusted) else None
+
+    def _stands(self) -> bool:
+        seen, times = self._trusted(), self.settings.times
+        if seen is None:  # nothing tells: by the time that the blind way down takes, with some to spare
+            return self.elapsed >= len(self._shares) * self.settings.period + times.settled
+        low = self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
+        return low and self._heights[0] - self._heights[-1] < times.rest_sunk
+
+    def _is_off(self) -> bool:
+        """True once the legs carry nothing, so that the laws may take over."""
+        seen = self._trusted()
+        return self.settings.dry_run or (seen is not None and self._height(seen) >= self._lifts_at)
+
+    # What the laws want.
+
+    def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
+        """Setpoints of both laws while they are in command, and what is wrong with them."""
+        if self.supervisor.state not in GUIDED:
+            return None, []
+        try:
+            seen = object_state(self._states, self.rig)
+            if self.supervisor.state is State.FLY:
+                distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
+                card = [own.map.hover_thrust for own in self.spin.chosen()]
+                one, other = (sent.thrust / hover for sent, hover in zip(self._sent, card, strict=True))
+                self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
+            if self._commands is None or self._count % self._every == 0:
+                self._commands = self.controller.step(seen, self.goal(self._now))
+            laws = [law + self._probe() for law in (self._commands.leader, self._commands.follower)]
+            mapped = [setpoints.to_setpoint(law, constants) for law, constants in zip(laws, self.maps, strict=True)]
+        except (PacketError, ValueError, FloatingPointError) as error:
+            return None, [Fault(Event.BAD_STATE, str(error))]
+        self._highest_place = max(self._highest_place, self._height(seen))
+        # A dry run never lifts: the laws ask for more and more.
+        saturated = any(one.saturated for one in mapped) and not self.settings.dry_run
+        if self._saturated.update(saturated, self._now):
+            return mapped, [Fault(Event.SATURATED, f"for {self.settings.limits.saturation_time:g} s")]
+        return mapped, []
+
+    def goal(self, now: float) -> np.ndarray:
+        """Goal of O (3,) at `now` [m]; while landing it sinks, far below the ground, since the laws lag behind it."""
+        goal = self._monitor.origin + np.array(self.settings.goal)
+        if self._probes:
+            goal[2] = self._monitor.origin[2] + min(self.settings.goal[2], probe.HEIGHT)
+        if self.supervisor.state is State.LAND:
+            sunk = self.settings.times.land_speed * (now - self.supervisor.since)
+            goal[2] = max(self._monitor.origin[2] + self._land_height - sunk, self._monitor.origin[2] - 1.0)
+        return goal
+
+    @property
+    def carry(self) -> str:
+        """In a dry run on motion capture: what is to be done by hand, so that the drones' IMUs can judge the axes."""
+        return self._monitor.not_shown() if self._mocap is not None and self.settings.dry_run else ""
+
+    @property
+    def _probes(self) -> bool:
+        """True at the begin of a flight on motion capture, whose axes no flight has shown to be right."""
+        return self._mocap is not None and self.supervisor.state is State.FLY and self.elapsed < probe.TIME
+
+    def _probe(self) -> np.ndarray:
+        return probe.command(self.elapsed, self.rig.span) if self._probes else np.zeros(3)
+
+    # What comes next.
+
+    def _progress(self) -> list[Fault]:
+        """Events of time and place."""
+        state, elapsed, times, dry = self.supervisor.state, self.elapsed, self.settings.times, self.settings.dry_run
+        can_fly, infos = packets.ARMED | packets.CAN_FLY, [one.info for one in self._states]
+        armed = dry or all(info & can_fly == can_fly for info in infos)
+        flying = any(info & packets.FLYING for info in infos) or not all(self._fresh)
+        hindered = self._holds > self.settings.limits.gaps + 1 or any(link.lost for link in self.links)
+        heard = all(self._fresh) and all(watch.hears for watch in self._monitor.uplinks)
+        resumes = heard and self.supervisor.may_resume and not (hindered or self._stands())
+        reached = {
+            Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
+            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_off(),
+            Event.TIME_UP: state is State.FLY and elapsed >= self.settings.seconds,
+            Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._stands(),
+            Event.RESUMED: state is State.HOLD and self._back.update(resumes, self._now),
+            Event.GROUNDED: state is State.STOP and elapsed >= times.stop and not flying,
+        }
+        events = [Fault(event) for event, is_reached in reached.items() if is_reached]
+        if state is State.CHECK and self.ready is not None:
+            events.append(Fault(Event.READY if self.ready else Event.REFUSED, self.refusal))
+        if state is State.SPIN and elapsed >= times.spin:
+            known = [Fault(Event.CURVE_KNOWN, "dry run")] if dry else None
+            events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
+        if elapsed >= self._limit(state):
+            stuck = state is State.RAMP and not self._is_off()
+            text = self._stuck() if stuck else f"{state.value} lasted {elapsed:.1f} s"
+            events.append(Fault(Event.TIMEOUT, text))
+        return events
+
+    def _stuck(self) -> str:
+        return self._take_off.stuck(self.maps)
+
+    def _limit(self, state: State) -> float:
+        """How long a state may last [s]."""
+        times = self.settings.times
+        landing = (self._land_height + 0.3) / times.land_speed + times.land_spare
+        own = {State.FLY: self.settings.seconds + 1.0, State.LAND: landing}
+        own |= {State.HOLD: self._hold_for, State.DESCEND: self._descend_for}
+        return own.get(state, times.limits.get(state, math.inf))
+
+    def _advance(self, faults: list[Fault]) -> None:
+        before = self.supervisor
+        self.supervisor = before.after(faults, self._now)
+        if self.supervisor.cause and not before.cause and (excuse := self.excuse(self.supervisor.cause)):
+            raise excuse
+        entered = self.supervisor.state
+        if entered is before.state:
+            return
+        names = [f"{fault.event.name}: {fault.detail}" if fault.detail else fault.event.name for fault in faults]
+        self.note("transition", self._now, before=before.state.value, after=entered.value, events=names)
+        if entered is State.FLY and before.state is State.RAMP:
+            self.controller.reset()
+            self._commands, self._needed = None, self._take_off.needed([one.quaternion for one in self._states])
+        if entered is State.LAND and before.state is not State.HOLD:
+            self._land_height = self._height(self._object())
+        if entered is State.DESCEND:
+            highest = max(filter(math.isfinite, self._heights), default=0.0)  # the fault may be a jump of the height
+            self._descend_for = self.settings.times.descent_limit(highest)
+            self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
+        if entered is State.HOLD:
+            self._hold(faults)
+
+    def _hold(self, faults: list[Fault]) -> None:
+        """Plan the time until a drone that may not hear is stopped by its own firmware."""
+        self._holds += 1
+        self._back = Sustained(self.settings.limits.fresh)
+        age = max((value for value in self._ages if math.isfinite(value)), default=0.0)
+        if any(fault.event in (Event.UNHEARD, Event.FROZEN) for fault in faults):
+            heard = [watch.heard for watch in self._monitor.uplinks if math.isfinite(watch.heard)]
+            age = self._now - min(heard, default=self._now)
+        self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
+        # Gently: a drone that does not hear keeps its thrust, and the other must not sink away from it.
+        self._shares = setpoints.blind_shares(self._last_known_state(), age, self.settings.period, setpoints.GENTLE)
+
+    # What is sent.
+
+    def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+        state = self.supervisor.state
+        if state in GUIDED:
+            return [one.setpoint for one in mapped] if mapped else list(self._sent)
+        if state is State.SPIN:
+            return [setpoints.level(SPIN_THRUST)] * 2
+        if state is State.RAMP:
+            rising = self._object()
+            return self._take_off.wanted(self.elapsed, rising, self._height(rising), self.maps)
+        if state not in (State.DESCEND, State.HOLD):
+            return [ZERO, ZERO]
+        # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
+        seen, tilt = self._trusted(), (0.0, 0.0)
+        if state is State.HOLD and not any(map(operator.and_, self._monitor.estimators.trusted, self._fresh)):
+            seen = None  # it is of a moment ago
+        if seen is not None and not (self.settings.stand or self._monitor.estimators.contradiction):
+            tilt = setpoints.brake(seen.velocity)
+        if seen is not None and state is State.DESCEND:
+            share = setpoints.sinking_share(float(seen.velocity[2]), self.settings.times)
+        elif seen is not None:
+            share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
+        else:
+            share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
+        shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
+        return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
+
+    def _transmit(self, wanted: list[Setpoint]) -> None:
+        state, dry = self.supervisor.state, self.settings.dry_run
+        if state is State.RAMP:
+            rises = zip(wanted, self.maps, strict=True)
+            self._trims = [min(float(s.thrust), setpoints.MOST_TRIM * c.hover_thrust) for s, c in rises]
+        elif state in GUIDED:
+            parts = zip(self._trims, wanted, self.maps, strict=True)
+            period = self.settings.period
+            self._trims = [setpoints.smoothed(trim, s.thrust, period, c.hover_thrust) for trim, s, c in parts]
+        self._sent = wanted
+        self.highest = [max(most, value.thrust) for most, value in zip(self.highest, wanted, strict=True)]
+        sometimes = self._count % 10 == 0 and not dry
+        for link, watch, value, own in zip(self.links, self._monitor.uplinks, wanted, self._states, strict=True):
+            if state is State.STOP and self.elapsed < self.settings.times.stop:
+                link.command(packets.STOP)
+            elif state is State.KILL and not dry:
+                link.command(packets.EMERGENCY_STOP)
+            if state in (State.STOP, State.DONE) and sometimes and not own.info & packets.AUTO_ARMED:
+                link.command(packets.DISARM)  # its motors idle until then; one that arms itself would arm again
+            elif state is State.ARM and sometimes:
+                link.command(packets.ARM)
+            self._send(link, watch, ZERO if dry else value)
+
+    def _send(self, link: DroneLink, watch: UplinkWatch, value: Setpoint) -> None:
+        watch.sent(value.thrust, self._now)
+        link.send(packets.setpoint_packet(value))
+
+    def _record(self, sent: list[Setpoint], late: float, missed: int) -> None:
+        goal, state = self.goal(self._now), self.supervisor.state
+        laws = self._commands._asdict() if self._commands is not None and state in GUIDED else {}
+        hidden = laws.pop("hidden", None)
+        if hidden is not None:
+            laws["hidden"] = np.round(hidden, HIDDEN_DECIMALS)
+        self.note("tick", self._now, state=state.value, goal=goal, sent=sent, ages=self._ages, late=late, **laws)
+        shown = self._states, self._ages, (sent[0], sent[1]), late, missed
+        self.view = View(self._now - self._start, self.supervisor, *shown, self.carry)

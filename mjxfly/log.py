@@ -1,0 +1,175 @@
+"""What was flown, `python -m mjxfly.log LOG OUT`: figures and numbers, or a file for other programs.
+
+LOG is a flight log (.jsonl), a bag or cfclient's folder. OUT ends in .mcap (ROS 2 messages; of .jsonl alone), .csv or
+.parquet; or it is a new directory, for figures of the flight beside the simulation of the same commands.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mjxball import cli
+from mjxball.control import rotations
+from mjxball.errors import InputError
+from mjxball.evaluate.metrics import measure, rotor_limits
+from mjxball.evaluate.plots import PANELS, draw_flights
+from mjxball.evaluate.results import Result, scenario_title
+from mjxball.plotting import SIMULATED, STYLES, file_format, style
+from mjxball.sim.rollout import Trajectory
+from mjxball.sim.scenario import Scenario
+from mjxball.terminal import warn
+from mjxfly.log_export import WRITERS
+from mjxfly.log_import import UNKNOWN
+from mjxfly.recording import Recording, fly_again, read_recording
+from mjxfly.twin.conditions import Conditions
+
+MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
+DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
+ASSUMED = tuple((kind, index, f"assumed {text}" if kind == "cg_offset" else text) for kind, index, text in PANELS)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw or export a log; return the exit code."""
+    about, formats = (__doc__ or "").split("\n\n")
+    parser = cli.make_parser("python -m mjxfly.log", about, epilog=formats)
+    parser.add_argument("log", type=Path, metavar="LOG", help="flight log, bag, or folder of cfclient's logs")
+    parser.add_argument("out", type=Path, metavar="OUT", help="new file, whose ending says what, or new directory")
+    about = "figures of a bag: shipped plant, or file of the rig that flew"
+    parser.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
+    about = "of figures: screen (default), or paper: PDF of a column's width"
+    parser.add_argument("--style", choices=STYLES, default="screen", help=about)
+    options = parser.parse_args(arguments)
+    return cli.run_command(lambda: _draw_or_export(options))
+
+
+def _draw_or_export(options: argparse.Namespace) -> int:
+    out, kind = options.out, options.out.suffix
+    if not kind:
+        return evaluate_log(options.log, out, options.style, options.plant)
+    if kind not in WRITERS:
+        endings = ", ".join(WRITERS)
+        raise InputError(f"output {out} must end in {endings}, which chooses the format, or in none: a directory")
+    if options.plant or options.style != "screen":
+        raise InputError(f"--plant and --style belong to figures, and {out} is a file")
+    for remark in WRITERS[kind](cli.output_file(out, kind), options.log):
+        warn(f"note: {remark}")
+    print(out)  # noqa: T201
+    return 0
+
+
+def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None) -> int:
+    """Draw the log `path` into the new directory `out`, print how far the simulation is from it; the exit code.
+
+    `plant` is the rig that flew, if the log does not say. Raises InputError if it does.
+    """
+    recording = read_recording(path, cli.plant_setup(plant, "flight"))
+    if plant is not None and recording.policy != UNKNOWN:
+        raise InputError(f"flight log {path} says which rig flew: drop --plant")
+    cli.output_directory(out)
+    for remark in recording.remarks:
+        warn(remark)
+    recorded = result_of(recording, f"{recording.policy}, flown")
+    simulated = result_of(fly_again(recording), SIMULATED)
+    print(differences(recorded, simulated))  # noqa: T201
+    with style(look):
+        print(f"figure: {draw(recorded, simulated, recording.guided_rows, out)}")  # noqa: T201
+    return 0
+
+
+def result_of(recording: Recording, name: str) -> Result:
+    """A recording as a result; the scenario is what the simulation assumed."""
+    config, flight = recording.config, trajectory_of(recording)
+    met = Conditions.of(config)
+    numbers = (met.cg_speed, met.cg_amplitude, met.object_mass)
+    scenario = Scenario(*numbers, ball_start=met.ball, seconds=float(flight.time[-1]))
+    metrics = measure(flight, config.scenario.termination_distance, rotor_limits(config.plant, [scenario])[0])
+    return Result(name, scenario, metrics, flight, config.motion.kind)
+
+
+def trajectory_of(recording: Recording) -> Trajectory:
+    """A recording as a trajectory; what was not measured is NaN."""
+    rows = len(recording.time)
+    unknown = np.full((rows, 2, 3), np.nan)
+    return Trajectory(
+        time=recording.time,
+        position=recording.position,
+        velocity=recording.velocity,
+        euler=rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion)),
+        rates=recording.rates,
+        quaternion=recording.quaternion,
+        rotor_force=recording.rotor_force,
+        leader_command=recording.leader,
+        follower_command=recording.follower,
+        observation=recording.observation,
+        cg_offset=recording.cg_offset,
+        object_mass=np.full(rows, np.nan),
+        contact_force=unknown,
+        contact_torque=unknown,
+        goal=recording.goal[max(recording.guided_rows - 1, 0)],
+        target=recording.target,
+        diverged=np.array(False),
+    )
+
+
+def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
+    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file.
+
+    The goal is drawn for the first `guided` rows. The log does not tell the object's mass and CG: they are assumed.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    both = [without_goal(recorded, guided), _cut(without_goal(simulated, guided), valid_rows(recorded, simulated))]
+    path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
+    draw_flights(both, f"assumed: {scenario_title(recorded)}", path, ASSUMED)
+    return path
+
+
+def differences(recorded: Result, simulated: Result) -> str:
+    """How far both are apart, moment by moment: a table."""
+    a, b = recorded.flight, simulated.flight
+    moments = [moment for moment in MOMENTS if moment < a.time[-1]] + [float(a.time[-1])]
+    lines = ["time s   position mm   height mm   roll deg   (largest difference until then)"]
+    for moment in moments:
+        rows = a.time <= moment
+        apart = a.position[rows] - b.position[rows]
+        roll = np.degrees(a.euler[rows, 0] - b.euler[rows, 0])
+        numbers = np.linalg.norm(apart, axis=1).max(), np.abs(apart[:, 2]).max(), np.abs(roll).max()
+        lines.append(f"{moment:6.1f}{1e3 * numbers[0]:14.1f}{1e3 * numbers[1]:12.1f}{numbers[2]:11.2f}")
+    known = valid_rows(recorded, simulated)
+    if known < len(a.time):
+        lines.append(
+            f"the open-loop simulation is {DIVERGED:g} m away after {a.time[known]:.1f} s and not drawn from there on"
+        )
+    return "\n".join(lines)
+
+
+def valid_rows(recorded: Result, simulated: Result) -> int:
+    """For how many rows the simulation is less than `DIVERGED` from the recorded flight."""
+    apart = np.linalg.norm(recorded.flight.position - simulated.flight.position, axis=1)
+    lost = np.flatnonzero(~(apart < DIVERGED))
+    return int(lost[0]) if len(lost) else len(apart)
+
+
+def without_goal(result: Result, rows: int) -> Result:
+    """`result` without a goal after `rows`: it was not flown to."""
+    target = np.array(result.flight.target, float)
+    target[rows:] = np.nan
+    return dataclasses.replace(result, flight=dataclasses.replace(result.flight, target=target))
+
+
+def _cut(result: Result, rows: int) -> Result:
+    """`result` with nothing to draw of its motion after `rows`."""
+    flight, parts = result.flight, {}
+    for name in ("position", "velocity", "euler", "cg_offset"):
+        parts[name] = np.array(getattr(flight, name), float)
+        parts[name][rows:] = np.nan
+    return dataclasses.replace(result, flight=dataclasses.replace(flight, **parts))
+
+
+if __name__ == "__main__":
+    cli.quit_on_interrupt()
+    sys.exit(main())

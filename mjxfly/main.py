@@ -1,0 +1,341 @@
+"""Command line of `python -m mjxfly`: fly a policy with two Crazyflies, or rehearse it with their twin."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from mjxball import cli, terminal
+from mjxball.cli import run_command
+from mjxball.config import Config
+from mjxball.control.crazyflie import PairGains
+from mjxball.errors import InputError
+from mjxball.policy import Policy, policy_path
+from mjxball.policy.formats.c_header import weight_bytes
+from mjxfly import app_flight, clock, limits
+from mjxfly.app import generate
+from mjxfly.card import (
+    Controller,
+    ThrustChoice,
+    drone_of,
+    goal_of,
+    is_crazyflie,
+    limits_of,
+    load_policy,
+    motor_of,
+    times_of,
+    variants,
+)
+from mjxfly.crazyswarm import CrazyswarmPair, read_pair
+from mjxfly.display import live_view
+from mjxfly.limits import FlightSettings, Limits
+from mjxfly.mocap import KINDS, MocapSettings, ready
+from mjxfly.parameters import check_parameters
+from mjxfly.preflight import Preflight, read_gains
+from mjxfly.rehearsal import Rehearsal
+from mjxfly.session import FlightSetup, fly
+from mjxfly.setpoints import CURVE_NAMES
+from mjxfly.telemetry import Rig
+from mjxfly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
+from mjxfly.uri import HERE, Udp, Uri, check_pair, parse_uri, share_dongle
+
+SLOW = ("slow", 1.0, clock.SLOWEST)
+# Numbers with least and most: of the battery, and of the rehearsal's link.
+LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
+WORSE = {  # once the motors turn: cflib connects over a good link only
+    "loss": "share of lost datagrams",
+    "delay": "seconds that each is late",
+    "jitter": "seconds more, at random",
+}
+
+
+# What `--help` leaves to `--help all`, besides all of the groups `twin` and `thrust`.
+RARE = {"--upload", "--mocap-rate", "--mocap-std", "--mocap-option"}
+
+
+def make_parser() -> cli.Parser:
+    """The flags; what None stands for is the policy card's."""
+    rare = set(RARE)
+
+    def common(parser: cli.Parser, _: argparse.Namespace, topic: str | None) -> set[str] | None:
+        if topic == "all":
+            return None
+        parser.epilog = "Defaults are in brackets. --help all has the twin's faults and surroundings, and rare flags."
+        every = {flag for action in parser._actions for flag in action.option_strings}
+        return {"policy", *every} - rare
+
+    about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
+    usage = (
+        "%(prog)s POLICY.npz --leader URI --follower URI [FLAG ...]\n       %(prog)s POLICY.npz --rehearse [FLAG ...]"
+    )
+    parser = cli.make_parser("python -m mjxfly", about, usage=usage, describe=common)
+    policy = "the follower, a file or a shipped one's name"
+    parser.add_argument("policy", type=policy_path, metavar="POLICY.npz", help=policy)
+
+    add = parser.add_argument_group("the drones").add_argument
+    add("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
+    add("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
+    about = "links and parameters of two robots of a Crazyswarm2 file; --leader and --follower then are names in it"
+    add("--crazyflies", type=Path, metavar="FILE.yaml", help=about)
+    add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")
+    add("--slow", type=float, metavar="FACTOR", help="--rehearse: on a clock so many times slower than real time (1)")
+    add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
+
+    add = parser.add_argument_group("the flight").add_argument
+    add("--seconds", type=float, default=20.0, metavar="S", help="time under both laws before landing (20)")
+    about = "of O from its start, m (0 0 0.4; a stand: 0 0 0.08)"
+    add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
+    add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
+    about = "write all to this new file, JSON lines or .mcap (flight-DATE.jsonl; none for --rehearse)"
+    add("--log", type=Path, metavar="FILE", help=about)
+    about = "a live page of the log, for a browser on this machine (a free port)"
+    add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
+    add("--foxglove", type=int, metavar="PORT", help="--view: for Foxglove too, on this machine alone")
+    about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
+    add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
+    add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
+
+    _add_mocap(parser.add_argument_group("motion capture"))
+    thrust = parser.add_argument_group("thrust and firmware")
+    add = thrust.add_argument
+    about = "JSON of firmware parameters to upload, for both drones or each, over the card's"
+    add("--gains", type=Path, metavar="FILE", help=about)
+    about = "m (g + az) through the force curve, or the paper's HOVER + 1000 az (the card's)"
+    add("--thrust", choices=("calibrated", "paper"), help=about)
+    add("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
+    add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
+    add("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
+
+    twin = parser.add_argument_group("faults and surroundings of the twin")
+    kinds = ", ".join(FAULT_KINDS)
+    about = f"--rehearse: after S seconds with motors on; may be repeated: {kinds}"
+    twin.add_argument("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=about)
+    for name, _, high in LINK[1:]:
+        about = f"--rehearse: {WORSE[name]}, up to {high:g}"
+        twin.add_argument(f"--{name}", type=float, metavar="X", help=about)
+    add_twin_options(twin)
+    rare.update(flag for group in (thrust, twin) for action in group._group_actions for flag in action.option_strings)
+    return parser
+
+
+def _add_mocap(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
+    add("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
+    add("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
+    about = "--mocap: poses a second to each drone, 50 to 100 (100; on a shared dongle 50)"
+    add("--mocap-rate", type=float, metavar="HZ", help=about)
+    about = "--mocap: deviations of a pose for the estimators (0.01 0.05)"
+    add("--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help=about)
+    about = "--mocap: more for this kind, such as port=22222; may be repeated"
+    add("--mocap-option", action="append", default=[], metavar="KEY=VALUE", help=about)
+
+
+def mocap_settings(options: argparse.Namespace, links: Sequence[Uri]) -> MocapSettings | None:
+    """What the flags ask for both drones' `links`, None without --mocap. Raises InputError for anything unsound."""
+    if options.mocap is None:
+        for name in ("mocap_host", "bodies", "mocap_rate", "mocap_std", "mocap_option"):
+            if getattr(options, name):
+                raise InputError(f"--{name.replace('_', '-')} needs --mocap KIND")
+        return None
+    if options.rehearse:
+        raise InputError("--mocap is for drones that the cameras see: leave it out with --rehearse")
+    if options.mocap_host is None and options.mocap != "mock":
+        raise InputError(f"--mocap {options.mocap} needs --mocap-host HOST")
+    if options.bodies is None:
+        raise InputError("--mocap needs --bodies LEADER FOLLOWER, the names of the two rigid bodies")
+    if options.bodies[0] == options.bodies[1]:
+        raise InputError("--bodies names one body for both drones")
+    # 400 packets a second would fill a dongle that both drones share.
+    rate = options.mocap_rate or (50.0 if share_dongle(links) else 100.0)
+    if not 50 <= rate <= 100:
+        raise InputError(f"--mocap-rate must be 50 to 100, not {rate:g}")
+    deviation = tuple(options.mocap_std or MocapSettings.deviation)
+    if not all(1e-4 <= value <= 1 for value in deviation):
+        raise InputError("--mocap-std must be two numbers of 0.0001 to 1")
+    pairs = [text.partition("=") for text in options.mocap_option]
+    for text, (key, sign, _) in zip(options.mocap_option, pairs, strict=True):
+        if not key or not sign:
+            raise InputError(f"--mocap-option {text} is no KEY=VALUE")
+    more = {key: value for key, _, value in pairs}
+    bodies = (options.bodies[0], options.bodies[1])
+    return MocapSettings(options.mocap, options.mocap_host or "", bodies, rate, (deviation[0], deviation[1]), more)
+
+
+def crazyflies(options: argparse.Namespace) -> CrazyswarmPair | None:
+    """The pair of --crazyflies, whose links and bodies `options` get. Raises InputError."""
+    if options.crazyflies is None:
+        return None
+    if options.rehearse:
+        raise InputError("--crazyflies names drones to fly: leave it out with --rehearse")
+    pair = read_pair(options.crazyflies, options.leader, options.follower)
+    options.leader, options.follower = pair.uris
+    options.bodies = options.bodies or (pair.bodies if options.mocap else None)
+    return pair
+
+
+def parameters_of(options: argparse.Namespace, swarm: CrazyswarmPair | None) -> list[tuple[Path, PairGains]]:
+    """The files that firmware parameters come from, a later one's over an earlier one's. Raises InputError."""
+    found = [] if swarm is None else [(swarm.path, swarm.parameters)]
+    return found + ([(options.gains, read_gains(options.gains))] if options.gains else [])
+
+
+def check_options(options: argparse.Namespace) -> list[Uri]:
+    """The drones' links, as far as they are given. Raises InputError for anything unsound."""
+    if importlib.util.find_spec("cflib") is None:
+        raise InputError("cflib is not installed; pip install 'mjxball[fly]'")
+    links: list[Uri] = []
+    for flag in limits.NAMES:
+        uri = getattr(options, flag)
+        if uri is None and not options.rehearse:
+            raise InputError(f"--{flag} URI is needed, or --rehearse to fly the software twin")
+        links += [parse_uri(uri, f"--{flag}")] if uri is not None else []
+        if uri is not None and options.rehearse and not (isinstance(links[-1], Udp) and links[-1].host == HERE):
+            raise InputError(f"--{flag} {uri}: the twin of --rehearse answers at udp://{HERE}:PORT only")
+    if len(links) == 2:
+        check_pair(links[0], links[1])
+    for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0), SLOW, *LINK):
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:
+            raise InputError(f"--{name} must be {low:g} to {high:g}, not {value:g}")
+    if options.goal is not None and not all(math.isfinite(value) for value in options.goal):
+        raise InputError("--goal must be three finite numbers")
+    if options.log is not None:
+        check_log(options.log, viewed=options.view is not None)
+    check_view(options)
+    return links
+
+
+def check_view(options: argparse.Namespace) -> None:
+    """Raise InputError for a live view that cannot be had."""
+    if options.view is not None and ((options.rehearse and options.log is None) or not 0 <= options.view <= 65535):
+        raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
+    if options.foxglove is not None and (options.view is None or not 0 <= options.foxglove <= 65535):
+        raise InputError("--foxglove takes a port of 1 to 65535, or 0 for a free one, and goes with --view")
+
+
+def check_log(log: Path, viewed: bool) -> None:
+    """Raise InputError if the new file `log` cannot be written, or is to be `viewed` and cannot."""
+    if log.exists():
+        raise InputError(f"log file {log} exists; choose another name")
+    if log.suffix not in (".jsonl", ".mcap"):
+        raise InputError(f"log file {log} must end in .jsonl or .mcap; mjxfly.log makes other formats of it")
+    if not log.absolute().parent.is_dir():
+        raise InputError(f"the directory of log file {log} does not exist")
+    if log.suffix == ".mcap":
+        try:
+            importlib.import_module("mcap_ros2.writer")  # with what it needs itself
+        except ImportError:
+            raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[fly]'") from None
+    if log.suffix == ".mcap" and viewed:
+        raise InputError("--view follows a log of JSON lines: --log FILE.jsonl")
+
+
+def check_twin_options(options: argparse.Namespace) -> None:
+    """Raise InputError for options of a rehearsal that are unsound."""
+    own = [f"--{name}" for name in (*WORSE, "fault", "slow") if getattr(options, name)]
+    given = [*own, *given_twin_options(options)]
+    if given and not options.rehearse:
+        raise InputError(f"{given[0]} is for --rehearse only")
+    if options.upload and options.onboard != "int8":
+        raise InputError("--upload takes weights of 8 bits: --onboard int8 --upload")
+    if options.onboard and options.mocap:
+        raise InputError("--onboard cannot show that the axes of --mocap are right: leave one of them out")
+    check_twin(options)
+    for fault in options.fault:
+        read_fault(fault)
+
+
+def check_loaded(config: Config) -> None:
+    """Raise InputError if the twin of `config` cannot be loaded in flight."""
+    if not is_crazyflie(config):
+        raise InputError("--twin-load is for policies that were trained on Crazyflies, such as flight")
+
+
+def rehearsed_options(options: argparse.Namespace) -> list[str]:
+    """Which pair the twin is: ports, policy, apps."""
+    ports = [uri.rsplit(":", 1)[1] if uri else "0" for uri in (options.leader, options.follower)]
+    pair = ["--ports", *ports, "--policy", str(options.policy)]
+    pair += ["--onboard", options.onboard] if options.onboard else []
+    return pair
+
+
+def twin_options(options: argparse.Namespace) -> list[str]:
+    """The twin's options: link, faults, drones, surroundings."""
+    worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
+    return [*worse, *(f"--fault={fault}" for fault in options.fault), *given_twin_options(options)]
+
+
+def on_board(
+    options: argparse.Namespace, setup: FlightSetup, settings: FlightSettings
+) -> tuple[FlightSetup, FlightSettings]:
+    """The flight for --onboard. Raises InputError for a policy that cannot fly there."""
+    if options.thrust or options.hover or options.mass:
+        raise InputError("--onboard flies the thrust law in the app: leave --thrust, --hover and --mass out")
+    policy, name = load_policy(options.policy), options.policy.stem
+    generate.check_policy(policy, name)
+    idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
+    weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None
+    apps = app_flight.Apps(name, idents, round(1000 * policy.card["control_period"]), weights)
+    variants = app_flight.variants_of(setup.variants, setup.rig, settings)
+    return replace(setup, variants=variants, apps=apps), app_flight.settings_of(settings)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly; exit code 0 if nothing went wrong, 1 after a fault, 2 on bad input."""
+    options = make_parser().parse_args(arguments)
+
+    def command() -> int:
+        swarm = crazyflies(options)
+        links = check_options(options)
+        check_twin_options(options)
+        capture = mocap_settings(options, links)
+        log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
+        policy = Policy(load_policy(options.policy), options.policy.stem)
+        controller = Controller(policy)
+        config = controller.config
+        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
+        more: PairGains = ({}, {})
+        for path, given in parameters_of(options, swarm):
+            check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
+            more = {**more[0], **given[0]}, {**more[1], **given[1]}
+        if options.twin_load is not None:
+            check_loaded(config)
+        rig = Rig.of_card(policy.card)
+        period = policy.control_period / limits.ticks_per_command(policy.control_period)
+        goal = tuple(options.goal or goal_of(config))
+        if not limits.within_fence(goal, rig, Limits()):
+            raise InputError(f"--goal {' '.join(f'{value:g}' for value in goal)} puts a drone beyond the fence")
+        bounds, stand = limits_of(config, goal, options.battery), config.plant.stand != "free"
+        settings = FlightSettings(
+            options.seconds, goal, options.dry_run, period, motor_of(config), stand, bounds, times_of(config)
+        )
+        setup = FlightSetup(
+            controller, variants(config, choice, more), choice.curve or "linear", rig, Preflight(drone=drone_of(config))
+        )
+        if options.onboard:
+            setup, settings = on_board(options, setup, settings)
+        for text in swarm.describe(rig) if swarm is not None else []:
+            terminal.say(text)
+        with contextlib.ExitStack() as stack:
+            uris = (options.leader, options.follower)
+            if options.rehearse:
+                clock.slow_down(options.slow or 1.0)
+                twin = stack.enter_context(Rehearsal([*rehearsed_options(options), *twin_options(options)]))
+                uris, setup = twin.uris, replace(setup, rehearsal=twin)
+            if capture is not None:
+                setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
+            if options.view is not None and log is not None:
+                print(stack.enter_context(live_view(log, options.view, options.foxglove)).line, flush=True)  # noqa: T201
+            if log and not options.log:
+                print(f"log: {log}", flush=True)  # noqa: T201
+            return fly(uris, setup, settings, log, list(sys.argv if arguments is None else arguments))
+
+    return run_command(command)

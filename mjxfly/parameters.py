@@ -1,0 +1,94 @@
+"""Which firmware parameters a file may have written to the drones, and whether they still fly with its gains.
+
+Gains are judged by the closed loop that they make: the pair's attitude loop (`control.margins`), both drones with the
+gains of one. It must be stable, with something to spare, and about as fast as the one that the policy was trained on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.control.axes import Axis, axes
+from mjxball.control.crazyflie import PARAMETERS, PairGains, pair_gains, with_gains
+from mjxball.control.margins import REQUIREMENTS, Margins, gains_of, margins
+from mjxball.errors import InputError
+from mjxfly.card import is_crazyflie, with_curve
+from mjxfly.limits import NAMES
+from mjxfly.setpoints import CurveName
+from mjxball.reading import near
+
+ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
+OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
+NOISE = re.compile(r"\.(pN|mN|std|ext\w*Std)")  # standard deviations, which a filter divides by
+DEVIATIONS = (1e-6, 1e3)  # of them
+SPARE = 1.5  # by which the loop's gain may be wrong either way: motors, battery, inertia
+RANGE = 3.0  # factor of the bandwidth, either way: at a third of the gains the shipped loops have 0.38 of theirs
+
+
+def is_written(name: str) -> bool:
+    """Whether the parameter `name` of a file goes to the drones: a gain, or a setting of their positioning."""
+    return name in PARAMETERS or (name.split(".", maxsplit=1)[0] in ESTIMATION and name not in OWN)
+
+
+def check_parameters(config: Config, curves: Sequence[CurveName], more: PairGains, where: str) -> None:
+    """Raise InputError, which begins with `where`, for parameters of leader and follower that would not fly.
+
+    `curves` are those that the drones' firmware may have, by which a policy's own gains differ.
+    """
+    for number, (name, given) in enumerate(zip(NAMES, more, strict=True)):
+        for parameter, value in given.items():
+            _check_value(parameter, value, f"{where}: {parameter} of the {name}")
+        if not PARAMETERS.keys() & given.keys():
+            continue
+        for curve in curves:
+            own = with_curve(config, curve)
+            trained = pair_gains(own.autopilot)[number]
+            _check_loops(own, trained, given, f"{where}: the {name}")
+
+
+def _check_value(parameter: str, value: float, where: str) -> None:
+    if not is_written(parameter):
+        groups = ", ".join(ESTIMATION)
+        raise InputError(
+            f"{where} is neither a gain of pid_attitude or pid_rate nor a setting of {groups}"
+            f"{near(parameter, PARAMETERS)}: leave it out"
+        )
+    if parameter in PARAMETERS:
+        low, high = configs.range_of(f"autopilot.{PARAMETERS[parameter][0]}")
+        if not low <= value <= high:
+            raise InputError(f"{where} must be {low:g} to {high:g}, not {value:g}")
+    low, high = DEVIATIONS
+    if NOISE.search(parameter) and not low <= value <= high:
+        raise InputError(f"{where} must be {low:g} to {high:g}, not {value:g}")
+
+
+def _check_loops(config: Config, trained: Mapping[str, float], given: Mapping[str, float], where: str) -> None:
+    chosen = {name: value for name, value in given.items() if name in PARAMETERS}
+    before = with_gains(config.autopilot, dict(trained))
+    after = with_gains(before, chosen)
+    for axis in _turned(config):
+        old, new = (
+            margins(gains_of(one, axis), axis.gain, config.plant.rotor_lag, REQUIREMENTS.delay)
+            for one in (before, after)
+        )
+        if gains_of(before, axis) != gains_of(after, axis) and (why := _fault(old, new)):
+            raise InputError(f"{where}'s {axis.name} loop {why}; mjxfly.rig.gains computes gains for a rig")
+
+
+def _turned(config: Config) -> list[Axis]:
+    """What the loops turn: the pair of `config`; for another rig, which is not known, one drone alone."""
+    if is_crazyflie(config):
+        return list(axes(config))
+    return [axis._replace(gain=axis.gain * axis.inertia_ratio) for axis in axes(configs.preset("flight"))]
+
+
+def _fault(old: Margins, new: Margins) -> str:
+    if min(new.gain_up, new.gain_down) < SPARE:
+        return f"would be unstable, or has less than a factor of {SPARE:g} to spare"
+    if not 1 / RANGE <= new.crossover / old.crossover <= RANGE:
+        text = f"would have {new.crossover:.2g} rad/s of bandwidth, and the policy was trained with {old.crossover:.2g}"
+        return f"{text}: {old.crossover / RANGE:.2g} to {RANGE * old.crossover:.2g} are flown"
+    return ""

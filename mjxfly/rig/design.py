@@ -1,0 +1,89 @@
+"""Command line of `python -m mjxfly.rig.design`: whether a rig can fly, what load it balances, and its plan."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mjxball import cli, pictures
+from mjxball.config import Config, cg_limit, thrust_over_weight, total_mass
+from mjxball.control.margins import unstable_axes
+from mjxball.errors import InputError
+from mjxball.files import write_whole
+from mjxball.plant.trim import heaviest_object, largest_amplitude
+from mjxball.terminal import say
+
+WAYS = tuple((math.cos(turn * math.pi / 6), math.sin(turn * math.pi / 6)) for turn in range(6))  # and their opposites
+SHARES = (0.25, 0.5, 1.0)  # of the way to the object's end, at which the heaviest load is shown
+
+
+def parser() -> cli.Parser:
+    """The flags."""
+    result = cli.make_parser("python -m mjxfly.rig.design", "Say whether a rig can fly and what load it balances.")
+    about = "shipped plant, file of a rig, or a model of a drone, MJCF or URDF (pair)"
+    result.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
+    result.add_argument("--out", type=Path, metavar="PLAN.svg", help="write a picture of the rig from above")
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compute, print, draw; return the exit code, 1 for a rig that does not balance its own object."""
+    options = parser().parse_args(arguments)
+    return cli.run_command(lambda: _design(options))
+
+
+def _design(options: argparse.Namespace) -> int:
+    if options.out:
+        cli.output_file(options.out, ".svg")
+    settings = cli.plant_setup(options.plant)
+    for name in unstable_axes(settings):
+        raise InputError(
+            f"{options.plant}: with its autopilot.{name} and {name}_rate the rig does not hold its {name}; "
+            "mjxfly.rig.gains computes gains"
+        )
+    held = balanced(settings)
+    for line in report(settings, held):
+        say(line)
+    if options.out:
+        write_whole(options.out, picture(settings, held))
+    return 0 if held >= 0 else 1
+
+
+def balanced(settings: Config) -> float:
+    """How far from O the CG of the rig's own object may rest [m], on the object; negative: not even at O.
+
+    In the plane the least of twelve directions.
+    """
+    plant, margin = settings.plant, settings.scenario.trim_margin
+    ways = WAYS if len(plant.directions) == 2 else (None,)
+    held = (largest_amplitude(settings, plant.object_mass, margin, way) for way in ways)
+    return min(*held, cg_limit(plant))
+
+
+def report(settings: Config, held: float) -> list[str]:
+    """Lines for a person: weight and thrust, how far from O the rig's own object rests, heavier ones."""
+    plant, limit = settings.plant, cg_limit(settings.plant)
+    load, share = f"its object of {plant.object_mass:.3g} kg", 1 / thrust_over_weight(plant)
+    can = f"can fly and balances {load} up to {held:.3g} m" if held >= 0 else f"cannot balance {load} even at 0 m"
+    axis = plant.cg_axis[0]
+    loads = (f"{heaviest_object(settings, part * limit):.3g} kg at {part * limit:.3g} m" for part in SHARES)
+    return [
+        f"{plant.count} drones, {total_mass(plant):.4g} kg in all: hovering takes {share:.0%} of the rotors' force",
+        f"the rig {can} from O, keeping {settings.scenario.trim_margin:.0%} of what hovering leaves",
+        f"the heaviest object that it balances, by the distance of its CG from O along {axis}: {', '.join(loads)}",
+    ]
+
+
+def picture(settings: Config, held: float) -> str:
+    """The rig from above as SVG, x to the right, with the places where the CG of its object may rest."""
+    plant = settings.plant
+    mounts = [drone.mount for drone in plant.drones]
+    far = tuple(max(held, 0.0) if axis in plant.directions else 0.0 for axis in (0, 1))
+    return pictures.plan(mounts, plant.leader, plant.of_drones("arm"), plant.object_size, far)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

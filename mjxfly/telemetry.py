@@ -1,0 +1,208 @@
+"""The pair's state: how old each drone's is, by arrival and by the firmware's clock, and the object's from both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.control import rotations
+from mjxfly.app.protocol import AppSample
+from mjxfly.packets import DroneState, Health, Packet, Sensed
+
+Note = Callable[..., None]  # note(kind, t=None, **fields): into the flight log, without blocking
+WRAP = 1 << 24  # [ms] the firmware's time stamps have 24 bits
+LONGEST_STEP = 10_000  # [ms] between two stamps; a larger one means that the drone was restarted
+DRIFT = 1e-4  # of the firmware's clock against ours
+
+
+class Sample(NamedTuple):
+    """One state as it arrived."""
+
+    state: DroneState
+    arrival: float  # [s] of our monotonic clock
+    stamp: float  # [s] of the firmware's clock, unwrapped
+
+
+class HealthSample(NamedTuple):
+    """One health packet as it arrived."""
+
+    health: Health
+    arrival: float  # [s] of our monotonic clock
+
+
+class SensedSample(NamedTuple):
+    """One packet of what a drone senses, as it arrived."""
+
+    sensed: Sensed
+    stamp: int  # [ms] of the firmware's clock
+
+
+class FirmwareClock:
+    """Maps time stamps to our clock: the least delay ever seen counts as none.
+
+    A packet that waited in a queue is then old by this clock although it has just arrived, and one that repeats an
+    old stamp grows old although packets keep coming.
+    """
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._time = 0  # [ms] unwrapped
+        self._offset = math.inf  # [s] arrival less stamp
+        self._newest = 0.0  # [s] of our clock
+        self.restarted = False
+
+    def update(self, stamp: int, arrival: float) -> float | None:
+        """Time of `stamp` [ms] in seconds, None if it is older than one already seen or its clock started anew."""
+        if self._last is not None:
+            step = (stamp - self._last + WRAP // 2) % WRAP - WRAP // 2
+            self.restarted = self.restarted or abs(step) > LONGEST_STEP
+            if step < 0 or self.restarted:
+                return None
+            self._time += step
+        self._last = stamp
+        seconds = self._time / 1000
+        self._offset = min(arrival - seconds, self._offset + DRIFT * max(arrival - self._newest, 0.0))
+        self._newest = arrival
+        return seconds
+
+    def seconds(self, stamp: int) -> float:
+        """Time of `stamp` [ms] in seconds, of a packet that came close to the newest state; NaN before that."""
+        if self._last is None:
+            return math.nan
+        return (self._time + (stamp - self._last + WRAP // 2) % WRAP - WRAP // 2) / 1000
+
+    def age(self, seconds: float, now: float) -> float:
+        """Age [s] at `now` of what was stamped at `seconds` of the firmware."""
+        return math.inf if self.restarted else now - (seconds + self._offset)
+
+
+class Telemetry:
+    """The newest state of one drone, and how many came."""
+
+    def __init__(self) -> None:
+        self.clock = FirmwareClock()
+        self.newest: Sample | None = None
+        self.health: HealthSample | None = None
+        self.sensed: SensedSample | None = None  # None until the first one, or if the firmware does not list it
+        self.app: AppSample | None = None
+        self.received = self.damaged = self.late = 0
+
+    def take(self, state: DroneState, stamp: int, arrival: float) -> bool:
+        """A state came with time stamp `stamp` [ms] at `arrival` [s]; false if a newer one came before."""
+        self.received += 1
+        seconds = self.clock.update(stamp, arrival)
+        if seconds is None:
+            self.late += 1
+            return False
+        self.newest = Sample(state, arrival, seconds)
+        return True
+
+    def age(self, now: float) -> float:
+        """The worse of both ages [s]; infinite before the first state."""
+        sample = self.newest
+        if sample is None:
+            return math.inf
+        return max(now - sample.arrival, self.clock.age(sample.stamp, now))
+
+
+class DroneLink(Protocol):
+    """What a flight needs of `link.Link`. Nothing here blocks."""
+
+    telemetry: Telemetry
+    lost: str | None
+    busy: bool | str  # with `write_later`: True while writing, else why it failed
+
+    def send(self, packet: Packet) -> None:
+        """Newest setpoint."""
+
+    def command(self, packet: Packet) -> None:
+        """Before any setpoint."""
+
+    def write_later(self, values: Mapping[str, float]) -> None:
+        """Write firmware parameters; see `busy`."""
+
+    def stuck_for(self, now: float) -> float:
+        """How long something has waited to be sent [s]."""
+        ...
+
+
+class ObjectState(NamedTuple):
+    """The assembly as the laws see it."""
+
+    position: np.ndarray  # (3,) of O in the world [m]
+    velocity: np.ndarray  # (3,) [m/s]
+    quaternion: np.ndarray  # (4,) attitude body -> world (w, x, y, z), as the follower measures it
+    rates: np.ndarray  # (3,) body rates [rad/s], likewise
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) attitude body -> world."""
+        return rotations.matrix_from_quaternion(self.quaternion)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Where the drones sit on the object, from O in body axes [m]."""
+
+    leader_mount: tuple[float, float, float]
+    follower_mount: tuple[float, float, float]
+
+    @classmethod
+    def of_card(cls, card: Mapping[str, Any]) -> Rig:
+        """The rig that a policy was trained for."""
+        plant: Any = configs.with_current_names({"plant": card["plant"]})["plant"]
+        leader = int(plant.get("leader", 0))
+        mounts = [tuple(drone["mount"]) for drone in plant["drones"]]
+        return cls(mounts[leader], mounts[1 - leader])
+
+    @classmethod
+    def of_plant(cls, plant: configs.Plant) -> Rig:
+        """That of a plant of two drones; InputError for any other."""
+        leader, follower = plant.pair
+        return cls(leader.mount, follower.mount)
+
+    @property
+    def mounts(self) -> np.ndarray:
+        """(2, 3) of leader and follower from O [m]."""
+        return np.array([self.leader_mount, self.follower_mount])
+
+    @property
+    def span(self) -> np.ndarray:
+        """(3,) leader from follower [m]."""
+        return np.array(self.leader_mount) - np.array(self.follower_mount)
+
+    @property
+    def weights(self) -> tuple[float, float]:
+        """Of leader and follower in O's position: where the mounts' weighted mean is O."""
+        ahead, behind = (float(np.linalg.norm(mount)) for mount in (self.leader_mount, self.follower_mount))
+        return behind / (ahead + behind), ahead / (ahead + behind)
+
+
+def object_state(states: Sequence[DroneState], rig: Rig) -> ObjectState:
+    """O's state from both drones' (leader, follower).
+
+    Position and velocity are the weighted means, which need no attitude and in which the two estimators' errors
+    average; attitude and rates are the follower's own, because its policy sees them (paper).
+    """
+    lead, follow = rig.weights
+    position = lead * states[0].position + follow * states[1].position
+    velocity = lead * states[0].velocity + follow * states[1].velocity
+    return ObjectState(position, velocity, states[1].quaternion, states[1].rates)
+
+
+def object_of_one(state: DroneState, mount: np.ndarray) -> ObjectState:
+    """O's state from one drone's alone: p_O = p - R r, with `mount` r (3,) [m]."""
+    matrix = rotations.matrix_from_quaternion(state.quaternion)
+    position = state.position - matrix @ mount
+    velocity = state.velocity - matrix @ np.cross(state.rates, mount)
+    return ObjectState(position, velocity, state.quaternion, state.rates)
+
+
+def yaw_of(state: DroneState) -> float:
+    """Yaw [rad] of one drone."""
+    return float(rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))[2])

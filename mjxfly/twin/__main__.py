@@ -1,0 +1,109 @@
+"""`python -m mjxfly.twin`: the twin as a process of its own. Prints its two URIs as one line of JSON.
+
+It ends when its standard input closes and its motors are off, so that it does not outlive the process that started it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import select
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball.cli import make_parser, run_command
+from mjxball.errors import InputError
+from mjxball.terminal import say
+from mjxfly import clock
+from mjxfly.app.host import compile_pair
+from mjxfly.card import load_policy
+from mjxfly.process import urgent
+from mjxfly.rehearsal import BEAT, LAST
+from mjxfly.telemetry import Rig
+from mjxfly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
+from mjxfly.twin.physics import make_pair
+from mjxfly.twin.server import Twin
+
+
+def main() -> int:
+    """Command line of the twin; returns the exit code."""
+    parser = make_parser("python -m mjxfly.twin", __doc__ or "")
+    parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
+    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
+    for name in ("loss", "delay", "jitter"):
+        parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
+    parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")
+    add_twin_options(parser)
+    parser.add_argument("--slow", type=float, default=1.0, metavar="FACTOR", help="of the runner's clock")
+    parser.add_argument("--fault", type=read_fault, action="append", default=[], metavar="KIND:DRONE@S")
+    options = parser.parse_args()
+    return run_command(lambda: serve(options))
+
+
+def serve(options: argparse.Namespace) -> int:
+    """Run the twin that `options` ask for until standard input ends."""
+    clock.slow_down(options.slow)
+    policy = load_policy(options.policy) if options.policy else None
+    card = policy.card if policy else None
+    cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
+    kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")
+    with urgent(), Twin(make_pair(card, kind, surroundings(options)), tuple(options.ports), cores) as twin:
+        worse = LinkFaults(options.loss, options.delay, options.jitter)
+        links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
+        waiting = [*links, *options.fault]
+        for one in tuple(waiting):
+            threading.Thread(target=inject_later, args=(twin, one, waiting), daemon=True).start()
+        report(uris=twin.uris)
+        with contextlib.suppress(KeyboardInterrupt):
+            attend(twin)
+        weights = Rig.of_card(card).weights if card else (0.5, 0.5)
+        place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
+        found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
+        found["never"] = [one.text for one in waiting if one.text]
+        report(**found, failure=str(twin.failure or ""), slow=isinstance(twin.failure, InputError))
+    return 0
+
+
+def attend(twin: Twin) -> None:
+    """Say how late the twin is, until standard input has ended and the motors are off, or the twin cannot keep up."""
+    left = math.inf  # when the runner left [s]
+    while twin.failure is None and clock.now() < left + LAST:
+        if math.isinf(left) and listen_on(sys.stdin.fileno(), BEAT):
+            left = clock.now()
+        if not math.isinf(left):
+            if not twin.turning:
+                return
+            clock.sleep(BEAT)
+        report(at=clock.now(), behind=twin.behind)
+
+
+def listen_on(pipe: int, seconds: float) -> bool:
+    """Whether `pipe` was closed within `seconds`; whatever comes over it is dropped."""
+    readable, _, _ = select.select([pipe], [], [], clock.real(seconds))
+    return bool(readable) and not os.read(pipe, 4096)
+
+
+def report(**fields: Any) -> None:
+    """One line for the runner, which may be gone."""
+    with contextlib.suppress(OSError):
+        say(json.dumps(fields))
+
+
+def inject_later(twin: Twin, one: Injection, waiting: list[Injection]) -> None:
+    """Wait for the first motor to turn, then until the fault is due; it does not wait any more then."""
+    while twin.truth.pwm.max() == 0 or max(twin.truth.thrust) == 0:
+        clock.sleep(0.01)
+    clock.sleep(one.after)
+    waiting.remove(one)
+    twin.inject(one)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

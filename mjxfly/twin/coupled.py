@@ -1,0 +1,292 @@
+"""The coupled Crazyflie model behind the twin: both drones' computers, motors and batteries over C MuJoCo.
+
+MuJoCo steps the model of `mjxball.assembly` every millisecond, with legs and a floor added, so that the pair stands on
+the ground (a stand: on its rest, its lowest place) and takes off and lands by contact. The cascade is that of
+`control.crazyflie`, flown on each drone's own estimates; what moves the ball is `physics.motion`, as in simulation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+
+from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
+from mjxball.config import Config, Plant
+from mjxball.control import crazyflie, rotations
+from mjxball.control.crazyflie import with_stock_gains
+from mjxball.physics import motion
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.mujoco import slide_force
+from mjxball.physics.step import rotor_shares
+from mjxfly.twin.avionics import TICK, Onboard, Power
+from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
+from mjxfly.twin.estimators import matrix_of, skew
+from mjxfly.twin.pair import RUNNING, Modes, PairState
+
+STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
+LEG = 0.03  # [m] from a drone's centre down to what it stands on
+FOOT_OFFSET = 0.03  # [m] from a drone's centre sideways to each of its legs
+FOOT = 0.003  # [m] radius
+
+
+def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
+    """The assembly's model with contact: O is at height 0 while the drones' legs stand on the floor."""
+    plant = dataclasses.replace(config.plant, object_mass=object_mass)
+    spec = build_spec(plant, STEP)
+    disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    spec.option.disableflags &= ~int(disabled)
+    floor = spec.geom("floor")
+    lowest = min(drone.mount[2] for drone in plant.drones)
+    floor.pos = [0.0, 0.0, lowest - LEG - FOOT if plant.stand != "pivot" else -1.0]
+    floor.contype, floor.conaffinity = 1, 2
+    for name in (LEADER, FOLLOWER):
+        drone = spec.body(name)
+        places = [(x, y, -LEG) for x in (-FOOT_OFFSET, FOOT_OFFSET) for y in (-FOOT_OFFSET, FOOT_OFFSET)]
+        for place in (*places, (0.0, 0.0, LEG)):
+            leg = drone.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[FOOT, 0, 0], pos=place, mass=0.0)
+            leg.contype, leg.conaffinity, leg.solref = 2, 1, [0.008, 1.0]
+        drone.add_site(name=f"{name}_imu", pos=[0, 0, 0], size=[0.001, 0.001, 0.001])
+        for sensor in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
+            spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu")
+    model = spec.compile()
+    model.actuator_ctrllimited[:] = False  # what a motor can give is `Power`'s to say, which knows the battery
+    return model
+
+
+def put_on(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> None:
+    """Fix a body of `mass` [kg] without size to the stick of `model`, `offset` [m] from O along the CG axis.
+
+    The stick's own centre is O. The state is not touched: position and velocity of O carry over, as of a load that
+    moves with the stick when it is let go.
+    """
+    body, axis = model.body(ASSEMBLY).id, "xy".index(plant.cg_axis)
+    before = float(model.body_mass[body])
+    after = before + mass
+    across = before * mass / after * offset**2  # about the common centre
+    model.body_mass[body] = after
+    model.body_ipos[body][axis] = mass / after * offset
+    model.body_inertia[body] += [0.0 if i == axis else across for i in range(3)]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+WORN_SAG = 0.47  # [V] at full power: with 3.0 V the pair falls as on the real firmware's rig, 1.15 m/s after 0.65 s
+SENSED = 6  # numbers of one drone's accelerometer and gyroscope
+
+
+class CoupledPair:
+    """See `physics.Pair`. One instance is one pair; `start` begins anew and keeps the parameters."""
+
+    def __init__(
+        self,
+        config: Config,
+        conditions: Conditions | None = None,
+        kind: DroneKind = DELIVERED,
+        surroundings: Surroundings = QUIET,
+    ):
+        self.config, self.conditions = config, conditions or Conditions.of(config)
+        self.kind, self.surroundings = kind, surroundings
+        plant = config.plant
+        self.model = grounded_model(config, self.conditions.object_mass)
+        self._loaded = False
+        self._free, self._heaves = plant.stand == "free", plant.stand == "heave"
+        self._roll = 1 if self._heaves else 0  # joint of a stand's roll
+        self._mounts = np.array([drone.mount for drone in plant.pair])
+        self._slide = self.model.joint(BALL_JOINT).dofadr[0]
+        self._slide_position = self.model.joint(BALL_JOINT).qposadr[0]
+        self._body = self.model.body(ASSEMBLY).id
+        self._share = plant.moving_fraction
+        self._rolling = config.motion.kind == "rolling"
+        self._roll_force = motion.make_rolling_force(config)
+        self._prescribed = None if self._rolling else motion.make_prescribed(config)
+        load = self.conditions
+        mass, amplitude, speed, zero = map(np.float64, (load.object_mass, load.cg_amplitude, load.cg_speed, 0.0))
+        self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))
+        self._keep, self._mean = rotor_shares(plant.rotor_lag * self.conditions.rotor_lag, None, STEP)
+        self.onboard = Onboard(kind, surroundings, with_stock_gains(config.autopilot), self._new_power())
+        self.start()
+
+    def _new_power(self) -> Power:
+        one, other = (a * b for a, b in zip(self.conditions.thrust, self.surroundings.gains, strict=True))
+        return Power(self.kind, self.conditions.battery, (one, other))
+
+    def start(self) -> PairState:
+        """See `Pair.start`."""
+        if self._loaded:
+            self.model, self._loaded = grounded_model(self.config, self.conditions.object_mass), False
+        self.data = mujoco.MjData(self.model)
+        self._rotors, self._targets = np.zeros((2, 4)), np.zeros((2, 4))
+        self.power = self.onboard.power = self._new_power()
+        self._steps, self._flown = 0, 0.0
+        self._left, self._moving = 0.0, False
+        self._place_ball()
+        return self._settle()
+
+    def place(self, state: PlantState) -> PairState:
+        """Put the pair, motors running, into a simulation's `state` (one world) and return it."""
+        data = self.data
+        if self._free:
+            data.qpos[:7], data.qvel[:6] = [*state.position, *state.quaternion], [*state.velocity, *state.rates]
+        else:
+            roll = float(rotations.roll_of_quaternion(state.quaternion))
+            data.qpos[:-1] = [state.position[2], roll][-len(data.qpos) + 1 :]
+            data.qvel[:-1] = [state.velocity[2], state.rates[0]][-len(data.qvel) + 1 :]
+        data.qpos[self._slide_position], data.qvel[self._slide] = state.ball_offset, state.ball_rate
+        self._rotors = np.array(state.rotor_force)
+        data.ctrl[:] = self._rotors.ravel()
+        self._moving, self._flown, self._steps = True, float(state.time), 2 * TICK
+        self._place_ball()
+        placed = self._settle()
+        self.onboard._loops = np.array(state.loops)
+        return placed
+
+    def _settle(self) -> PairState:
+        """Let sensors and estimators know where the pair is."""
+        mujoco.mj_forward(self.model, self.data)
+        position, _, matrix = self._pose()
+        velocity = self._velocity(matrix)
+        self.onboard.imu.settle(self._sensed())
+        self.onboard.start(position, self._quaternion(), velocity)
+        return self._state()
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        """See `Pair.set_parameter`."""
+        self.onboard.set_parameter(drone, name, value)
+
+    def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        """See `Pair.receive_pose`."""
+        self.onboard.receive_pose(drone, position, quaternion)
+
+    def disturb(self, drone: int, what: str, value: float) -> None:
+        """See `Pair.disturb`."""
+        match what:
+            case "battery":  # a cell that gives way has a higher resistance
+                self.power.charge[drone], self.power.sag[drone] = value, WORN_SAG
+            case "fade":
+                self.power.fading[drone] = value
+            case "gain":
+                self.power.strength[drone] *= value
+            case _:
+                self.onboard.positioning[drone].disturb(what, value)
+
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+        """See `Pair.advance`; `dt` is made of whole milliseconds, what is left over is made good later."""
+        self._left += dt
+        self.onboard.order(np.asarray(setpoints, float), modes)
+        count = round(self._left / STEP)
+        self._left -= count * STEP
+        for _ in range(count):
+            self._step()
+        return self._state()
+
+    def _step(self) -> None:
+        model, data = self.model, self.data
+        load = self.surroundings.load
+        if load is not None and not self._loaded and self._moving and self._flown >= load.after:
+            put_on(model, self.config.plant, load.mass, load.offset)
+            self._loaded = True
+        mujoco.mj_step1(model, data)
+        if self._steps % TICK == 0:
+            self._fly()
+        gap = self._rotors - self._targets  # of the motors' lag, from the step's begin to its end and in the mean
+        self._rotors = self._targets + self._keep * gap
+        data.ctrl[:] = (self._targets + self._mean * gap).ravel()
+        data.qfrc_applied[self._slide] = self._push_ball()
+        mujoco.mj_step2(model, data)
+        self._steps += 1
+        self._flown += STEP * self._moving
+        self._place_ball()
+        if not self.surroundings.exact:
+            self.onboard.sense(self._steps, self._sensed(), self._pose)
+
+    def _fly(self) -> None:
+        """Both cascades, once: what the motors are to give from here on."""
+        if self.surroundings.exact:
+            euler = rotations.euler_from_matrix(self.data.xmat[self._body].reshape(3, 3))
+            pwm = self.onboard.control(np.stack([euler] * 2), np.stack([self._rates()] * 2))
+        else:
+            pwm = self.onboard.control()
+        self._moving = self._moving or bool((self.onboard.thrust >= crazyflie.IDLE).any())
+        self.power.drain(pwm, TICK * STEP)
+        self._targets = self.power.force(pwm)
+
+    def _rates(self) -> np.ndarray:
+        velocity = self.data.qvel
+        return velocity[3:6].copy() if self._free else np.array([velocity[self._roll], 0.0, 0.0])
+
+    # The ball.
+
+    def _push_ball(self) -> float:
+        """Force on the ball along its slide [N]: friction and stops, or what its prescribed motion takes."""
+        model, data = self.model, self.data
+        if self._rolling:
+            offset, rate = data.qpos[self._slide_position], data.qvel[self._slide]
+            return float(self._roll_force(offset, rate, self._share * self._load.object_mass))
+        if not self._moving:
+            return 0.0
+        assert self._prescribed is not None
+        data.qfrc_applied[self._slide] = 0.0
+        mujoco.mj_fwdActuation(model, data)
+        wanted = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
+        slides = slice(self._slide, self._slide + 1)
+        return float(slide_force(model, data, slides, wanted, data.qfrc_actuator - data.qfrc_bias)[0])
+
+    def _place_ball(self) -> None:
+        """Put a prescribed ball where it is to be, so that no error adds up; a rolling one at its start."""
+        if self._rolling:
+            if self._steps == 0:
+                self.data.qpos[self._slide_position] = self.conditions.ball
+            return
+        assert self._prescribed is not None
+        cg = self._prescribed(np.float64(self._flown), self._load)
+        self.data.qpos[self._slide_position] = cg.offset / self._share
+        self.data.qvel[self._slide] = cg.rate / self._share if self._moving else 0.0
+
+    @property
+    def cg_offset(self) -> float:
+        """Where the CG is, from O along the stick [m]."""
+        return float(self._share * self.data.qpos[self._slide_position])
+
+    @property
+    def rotor_force(self) -> np.ndarray:
+        """(2, 4) of leader and follower [N]."""
+        return self._rotors.copy()
+
+    # What the sensors are shown, and the truth.
+
+    def _sensed(self) -> np.ndarray:
+        """(2, 6) specific force [m/s2] and rates [rad/s] of both drones, body axes, one step old."""
+        return self.data.sensordata.reshape(2, SENSED)
+
+    def _quaternion(self) -> np.ndarray:
+        q = self.data.qpos
+        half = 0.0 if self._free else q[self._roll] / 2
+        return q[3:7].copy() if self._free else np.array([math.cos(half), math.sin(half), 0.0, 0.0])
+
+    def _of_origin(self, numbers: np.ndarray) -> np.ndarray:
+        """O's (3,) in the world, from the joints' positions or velocities."""
+        return numbers[:3] if self._free else np.array([0.0, 0.0, numbers[0] if self._heaves else 0.0])
+
+    def _pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both drones' positions (2, 3), the quaternion (4,) and the rotation matrix of all."""
+        quaternion = self._quaternion()
+        matrix = matrix_of(quaternion)
+        return self._of_origin(self.data.qpos) + self._mounts @ matrix.T, quaternion, matrix
+
+    def _velocity(self, matrix: np.ndarray) -> np.ndarray:
+        """Velocities (2, 3) of both drones in the world."""
+        return self._of_origin(self.data.qvel) - self._mounts @ skew(self._rates()) @ matrix.T
+
+    def _state(self) -> PairState:
+        position, quaternion, matrix = self._pose()
+        velocity = self._velocity(matrix)
+        both, turning = np.stack([quaternion] * 2), np.stack([self._rates()] * 2)
+        if self.surroundings.exact:
+            self.onboard.imu.settle(self._sensed())
+            report = self.onboard.reported(position, velocity, both, turning, np.full((2, 9), 1e-5))
+        else:
+            report = self.onboard.report()
+        force, battery = self._sensed()[:, :3].copy(), self.power.voltage.copy()
+        return PairState(position, velocity, both, turning, force, battery, report)

@@ -1,0 +1,186 @@
+"""A stand-in for the physics of a pair, without MuJoCo, and which physics a policy needs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.control import motors, rotations
+from mjxball.errors import InputError
+from mjxfly.card import config_of, is_crazyflie
+from mjxfly.packets import Setpoint, angles
+from mjxfly.setpoints import ForceCurve
+from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
+from mjxfly.twin.pair import RUNNING, Modes, Pair, PairState, Report, remembered
+
+CURVE = ForceCurve()
+# What the stand-in's drones report is that uncertain: no real stream repeats bit by bit. Standard deviations.
+VELOCITY_NOISE, RATE_NOISE = 1e-3, 5e-3  # [m/s], [rad/s]
+FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
+
+
+@dataclass(frozen=True)
+class StandInPlant:
+    """Numbers of the stand-in."""
+
+    mass: float = 0.07  # of all [kg]
+    mounts: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.0, -0.15, 0.0), (0.0, 0.15, 0.0))  # [m]
+    inertia: float = 1.5e-3  # about the axes across the stick [kg m2]
+    frequency: float = 9.0  # of the attitude with both drones' motors on [rad/s]
+    damping: float = 0.9  # ratio
+    motor_lag: float = 0.05  # [s]
+    curve: ForceCurve = CURVE
+    gravity: float = 9.81  # [m/s2]
+    full: float = 4.1  # battery without load [V]
+    sag: float = 0.35  # at full thrust [V]
+    drain: float = 0.0008  # at full thrust [V/s]
+
+
+class StandIn:
+    """See `Pair`."""
+
+    cg_offset = math.nan
+    rotor_force = np.zeros((2, 4))  # not modelled
+
+    def __init__(
+        self,
+        plant: StandInPlant = StandInPlant(),
+        kind: DroneKind = DELIVERED,
+        surroundings: Surroundings = QUIET,
+    ):
+        self.plant, self.kind, self.surroundings = plant, kind, surroundings
+        self._mounts = np.array(plant.mounts)
+        self._random = np.random.default_rng(surroundings.seed)
+        self._span = self._mounts[1] - self._mounts[0]
+        self.start()
+
+    def start(self) -> PairState:
+        """See `Pair.start`."""
+        self._position, self._velocity = np.zeros(3), np.zeros(3)
+        self._quaternion, self._rates = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        self._thrust = np.zeros(2)  # of each drone [N]
+        self._charge = np.full(2, self.plant.full)
+        self._commands, self._poses = np.zeros(2), np.zeros((2, 7))
+        return self._state(np.zeros(3), np.zeros(3))
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        """The stand-in has no gains."""
+
+    def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        """The stand-in has no estimator, but says what came."""
+        self._poses[drone] = remembered(self._poses[drone], position, quaternion)
+
+    def disturb(self, drone: int, what: str, value: float) -> None:
+        """Of the faults, the stand-in knows the battery's."""
+        if what == "battery":
+            self._charge[drone] = value
+
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+        """See `Pair.advance`; a drone whose stabilizer hangs keeps its thrust and levels."""
+        plant = self.plant
+        held = np.array(modes.held)[:, None]
+        setpoints = np.where(held, np.array([[0.0, 0.0, 0.0, thrust] for thrust in self._commands]), setpoints)
+        setpoints = setpoints * np.array(modes.run)[:, None]
+        self._commands = setpoints[:, 3].copy()
+        wanted = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
+        self._thrust += (wanted - self._thrust) * -np.expm1(-dt / plant.motor_lag)
+        self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
+        matrix = rotations.matrix_from_quaternion(self._quaternion)
+        force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
+        turning = self._turning(setpoints, matrix)
+        self._rates = np.clip(self._rates + dt * turning, -FASTEST, FASTEST)
+        self._quaternion = rotations.integrate_quaternion(self._quaternion, dt * self._rates)
+        self._velocity = self._velocity + dt * force
+        self._position = self._position + dt * self._velocity
+        if self._position[2] <= 0:
+            force, turning = self._rest(force), np.zeros(3)
+        return self._state(force, turning)
+
+    def _turning(self, setpoints: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Angular acceleration (3,) [rad/s2]: both drones' attitude loops, and the moment of unequal thrusts."""
+        plant, euler = self.plant, rotations.euler_from_matrix(matrix)
+        turning = np.zeros(3)
+        on = self._thrust > 0.01
+        for row, running in zip(setpoints, on, strict=True):
+            if running:
+                roll, pitch, yaw_rate = angles(Setpoint(float(row[0]), float(row[1]), float(row[2]), 0))
+                tilt = plant.frequency**2 * (np.array([roll, pitch]) - euler[:2])
+                turning += 0.5 * np.append(tilt, 5.0 * (yaw_rate - self._rates[2]))
+        turning[:2] -= on.mean() * 2 * plant.damping * plant.frequency * self._rates[:2]
+        lifts = self._mounts[:, :2] * self._thrust[:, None]
+        moment = np.array([lifts[:, 1].sum(), -lifts[:, 0].sum()])
+        turning[:2] += moment / plant.inertia
+        return turning
+
+    def _rest(self, force: np.ndarray) -> np.ndarray:
+        """The ground stops everything and levels the stick; it pushes but does not pull."""
+        lifting = force[2] > 0
+        self._position = np.append(self._position[:2], 0.0)
+        self._velocity = np.array([0.0, 0.0, max(self._velocity[2], 0.0) if lifting else 0.0])
+        matrix = rotations.matrix_from_quaternion(self._quaternion)
+        if matrix[2, 2] > 0:  # else it lies on its back
+            yaw = rotations.euler_from_matrix(matrix)[2]
+            self._quaternion = rotations.quaternion_from_euler(np.array([0.0, 0.0, yaw]))
+        self._rates = np.zeros(3)
+        return force if lifting else np.zeros(3)
+
+    def _state(self, acceleration: np.ndarray, turning: np.ndarray) -> PairState:
+        """With O at `acceleration` (3,) in the world [m/s2], the pair `turning` (3,) in body axes [rad/s2]."""
+        plant, matrix = self.plant, rotations.matrix_from_quaternion(self._quaternion)
+        arms = self._mounts @ matrix.T
+        swing = rotations.cross(self._rates, self._mounts) @ matrix.T
+        load = self._thrust / plant.curve.force(65535)
+        circling = rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
+        felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        force = felt + rotations.cross(turning, self._mounts) + circling
+        battery = self._charge - plant.sag * load
+        pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
+        position, velocity = self._position + arms, self._velocity + swing
+        quaternion, rates = (np.stack([one] * 2) for one in (self._quaternion, self._rates))
+        noise = self._random.standard_normal((2, 2, 3))
+        seen = velocity + VELOCITY_NOISE * noise[0], quaternion, rates + RATE_NOISE * noise[1]
+        drive = pwm, pwm, self._commands
+        return PairState(
+            position=position,
+            velocity=velocity,
+            quaternion=quaternion,
+            rates=rates,
+            specific_force=force,
+            battery=battery,
+            report=Report(position, *seen, force, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
+        )
+
+
+def make_pair(
+    card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, surroundings: Surroundings = QUIET
+) -> Pair:
+    """Physics of the rig that a policy's `card` describes; without one, the stand-in's own rig."""
+    return (
+        StandIn(kind=kind, surroundings=surroundings) if card is None else pair_of(config_of(card), kind, surroundings)
+    )
+
+
+def pair_of(
+    config: Config,
+    kind: DroneKind = DELIVERED,
+    surroundings: Surroundings = QUIET,
+    conditions: Conditions | None = None,
+) -> Pair:
+    """Physics of the rig of `config`; whatever is heavy is imported here, not above.
+
+    Raises InputError if the coupled model is needed and MuJoCo is not installed.
+    """
+    if not is_crazyflie(config):
+        leader, follower = config.plant.pair
+        mounts = (leader.mount, follower.mount)
+        return StandIn(StandInPlant(mounts=mounts), kind, surroundings)
+    try:
+        from mjxfly.twin.coupled import CoupledPair
+    except ModuleNotFoundError as error:
+        raise InputError(f"the twin of a Crazyflie pair needs {error.name}; pip install 'mjxball[fly]'") from None
+    return CoupledPair(config, conditions, kind, surroundings)

@@ -1,0 +1,10 @@
+"""`python -m mjxfly.view`."""
+
+import sys
+
+from mjxball.cli import quit_on_interrupt
+from mjxfly.view.main import main
+
+if __name__ == "__main__":
+    quit_on_interrupt()  # there is nothing to save
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""What a flight log says of how the flight goes: a text for now, and marks on the time axis."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mjxball.reading import parse_json
+from mjxball.view.flight import Mark
+from mjxfly.flight_log import LONGEST_LINE, read
+from mjxfly.log_import import is_foreign
+from mjxfly.log_schema import Record, decode
+from mjxfly.supervisor import FAULTS, State
+
+GOOD = {State.FLY.value, State.LAND.value}  # both laws are in command
+BAD = {State.HOLD.value, State.DESCEND.value, State.KILL.value}
+OVER = {State.STOP.value, State.DONE.value}  # as good or bad as what came before
+SEVERITY = {state.value: state.severity for state in State}
+FAULT_NAMES = {event.name for event in FAULTS}
+STREAMS = (b'"kind": "state"', b'"kind": "health"', b'"kind": "pose"')  # nearly all of a log, and no marks
+
+
+class FlightStatus:
+    """How the flight goes, by the records of its log: `text` in words, `level`, `ended`, and `marks`.
+
+    `level` is busy, good (the laws are in command, or it ended well) or bad (a fault). Marks have the log's times.
+    """
+
+    def __init__(self, text: str):
+        self.text, self.level, self.ended = text, "busy", False
+        self.marks: list[Mark] = []
+        self._why, self._begun = "", 0.0
+
+    def take(self, record: Record) -> None:
+        """Note any record but states."""
+        kind, now = record["kind"], record["t"]
+        if kind == "header":
+            self.text, self._begun = "connecting and checking", now
+        elif kind == "tick":
+            self._enter(record["state"])
+        elif kind == "check":
+            self.text = f"{'good' if record['passed'] else 'BAD'}: {record['name']}: {record['found']}"
+        elif kind == "transition":
+            self._transition(record)
+        elif kind == "refused":
+            self._end(now, "bad", f"refused: {record['text']}")
+        elif kind == "end":
+            why = f": {self._why}" if self._why else ""
+            level = "bad" if record["code"] else "good"
+            self._end(now, level, f"the flight has ended, exit code {record['code']}{why}")
+
+    def fail(self, why: str) -> None:
+        """The log itself cannot be followed."""
+        if self.level != "bad":
+            self.level, self._why = "bad", why
+            self.text = f"the log cannot be placed in time: {why}"
+
+    def _enter(self, state: str) -> None:
+        """What the supervisor does, and why once it is on the way down."""
+        if self.ended:
+            return
+        self.text = f"{state}: {self._why}" if self._why else state
+        if self.level != "bad" and state not in OVER:
+            self.level = "good" if state in GOOD else "busy"
+
+    def _transition(self, record: Record) -> None:
+        now, after, events = record["t"], record["after"], record["events"]
+        if not self.marks:
+            self._phase(self._begun, record["before"])
+        severity = SEVERITY.get(after, 0)
+        causes = [event for event in events if event.partition(":")[0] in FAULT_NAMES]
+        if causes:
+            self.level = "bad"
+            self.marks.append(Mark(now, "fault", ", ".join(map(_words, causes)), "bad"))
+        if causes or (severity > State.FLY.severity and events):
+            self._why = self._why or _words((causes or events)[0])
+        self._phase(now, after)
+        self._enter(after)
+
+    def _phase(self, now: float, state: str) -> None:
+        self.marks.append(Mark(now, "phase", state, "good" if state in GOOD else "bad" if state in BAD else ""))
+
+    def _end(self, now: float, level: str, text: str) -> None:
+        self.ended, self.level, self.text = True, level, text
+        self.marks.append(Mark(now, "end", text, level))
+
+
+def _words(event: str) -> str:
+    return event.lower().replace("_", " ")
+
+
+def placed(marks: Sequence[Mark], begin: float, last: float) -> tuple[Mark, ...]:
+    """`marks` counted from the time `begin` and put between 0 and `last`; phases that were over by then are not."""
+    moved = [mark._replace(time=min(max(mark.time - begin, 0.0), last)) for mark in marks]
+    phases = [mark for mark in moved if mark.kind == "phase"]
+    over = {id(one) for one, after in itertools.pairwise(phases) if after.time < 1e-6}
+    return tuple(mark for mark in moved if id(mark) not in over)
+
+
+def marks_of_log(path: Path, last: float) -> tuple[Mark, ...]:
+    """Marks of the whole log `path`, whose last tick is at `last` [s] of the recorded flight."""
+    status, end = FlightStatus(""), 0.0
+    for record in _told(path):
+        status.take(record)
+        if record["kind"] == "tick":
+            end = max(end, record["t"])
+    return placed(status.marks, end - last, last)
+
+
+def _told(path: Path) -> Iterable[Record]:
+    """Records of a log that was read before, but not those that come in streams: of the ticks the last alone."""
+    if is_foreign(path):
+        yield from read(path)
+        return
+    tick = b""
+    with path.open("rb") as stream:
+        while line := stream.readline(LONGEST_LINE):
+            if b'"kind": "tick"' in line:
+                tick = line
+            elif not any(kind in line for kind in STREAMS) and (record := _decoded(line)):
+                yield record
+    if record := _decoded(tick):
+        yield record
+
+
+def _decoded(line: bytes) -> Record | None:
+    try:
+        raw: Any = parse_json(line)
+        return decode(raw)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
