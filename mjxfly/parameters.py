@@ -15,10 +15,10 @@ from mjxball.control.axes import Axis, axes
 from mjxball.control.crazyflie import PARAMETERS, PairGains, pair_gains, with_gains
 from mjxball.control.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxball.errors import InputError
+from mjxball.reading import near
 from mjxfly.card import is_crazyflie, with_curve
 from mjxfly.limits import NAMES
 from mjxfly.setpoints import CurveName
-from mjxball.reading import near
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")

@@ -20,6 +20,7 @@ from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains, read_pair_ga
 from mjxball.control.motors import Motor
 from mjxball.errors import InputError
 from mjxball.files import read_text
+from mjxball.reading import near, parse_json
 from mjxfly import clock, packets, positioning
 from mjxfly.app.protocol import CONTROLLER, OUT_OF_TREE, PID
 from mjxfly.connection import LinkError
@@ -32,7 +33,6 @@ from mjxfly.process import together, wait_until
 from mjxfly.setpoints import CURVE_NAMES, CurveName, Variant, Variants
 from mjxfly.supervisor import Event, Fault
 from mjxfly.telemetry import DroneLink, Note, Rig, yaw_of
-from mjxball.reading import near, parse_json
 
 
 @dataclass(frozen=True)

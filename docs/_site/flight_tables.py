@@ -9,7 +9,6 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from mjxfly.twin.conditions import FAULT_KINDS, Conditions
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly import lift, setpoints
@@ -22,6 +21,7 @@ from mjxfly.mocap_supervision import MocapLimits
 from mjxfly.packets import THRUST_CEILING, THRUST_FLOOR
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import TRANSITIONS, Event, State
+from mjxfly.twin.conditions import FAULT_KINDS, Conditions
 from mjxfly.twin.drone import ACTED
 
 

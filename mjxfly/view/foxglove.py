@@ -18,10 +18,10 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from mjxball.errors import InputError
-from mjxfly.process import bounded
 from mjxball.reading import parse_json
 from mjxfly.log_schema import Record
 from mjxfly.messages import Encoder
+from mjxfly.process import bounded
 
 HOST = "127.0.0.1"
 PROTOCOL: Any = "foxglove.sdk.v1"

@@ -20,12 +20,12 @@ from tables import rows
 from vrpn_server import Poses, VrpnServer
 from wire import unpack_pose
 
-from mjxfly.main import check_options, main, make_parser, mocap_settings
 from mjxball.policy import load_file
 from mjxfly import mocap as motion_capture
 from mjxfly import packets, process
 from mjxfly.limits import FlightSettings
 from mjxfly.link import Link
+from mjxfly.main import check_options, main, make_parser, mocap_settings
 from mjxfly.mocap import Mocap, MocapError, MocapSettings, ready
 from mjxfly.mocap_child import Decimation
 from mjxfly.mocap_supervision import Frame, MocapLimits, Pose

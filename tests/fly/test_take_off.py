@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mjxball.control import rotations
-from mjxfly.twin import avionics
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.policy.team import is_for_any
 from mjxfly.card import Controller, goal_of, limits_of, load_policy
@@ -18,6 +17,7 @@ from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, State
 from mjxfly.takeoff import BEGIN, MOST, TakeOff
 from mjxfly.telemetry import ObjectState, Rig
+from mjxfly.twin import avionics
 from mjxfly.twin.conditions import Conditions, Surroundings
 from mjxfly.twin.virtual import VirtualTwin
 

@@ -19,9 +19,9 @@ from mjxfly import flight_log
 from mjxfly.display import live_view
 from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
+from mjxfly.process import bounded
 from mjxfly.view.foxglove import Foxglove
 from mjxfly.view.main import main as view
-from mjxfly.process import bounded
 
 client = pytest.importorskip("websockets.sync.client")
 exceptions = pytest.importorskip("websockets.exceptions")

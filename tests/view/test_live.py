@@ -23,7 +23,6 @@ from conftest import opened
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
-
 from mjxball.view.page import flight_page
 from mjxfly.display import live_view
 from mjxfly.flight_log import Journal

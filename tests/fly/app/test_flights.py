@@ -12,12 +12,12 @@ from onboard_bench import cores_of, needs_gcc
 import fly_faults_virtual
 from fly_faults_virtual import SETTLE, cause_of, code_of, settings_of
 from mjxball.control import rotations
-from mjxfly.twin import avionics
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly.app.protocol import Phase
 from mjxfly.card import Controller
 from mjxfly.supervisor import State as Laptop
+from mjxfly.twin import avionics
 from mjxfly.twin.conditions import FAULT_KINDS, Conditions, Surroundings, drone_kind
 from mjxfly.twin.virtual import VirtualTwin
 
