@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from mjxball.baselines import Mpc, Observer, Pid
-from mjxball.baselines.mpc_design import MpcTuning
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.followers import Baseline
 from mjxball.evaluate.batch import Batch
@@ -124,12 +123,22 @@ def costs_of(
     return total, shown
 
 
+def searched(gains: Any) -> list[str]:
+    """Names of those `gains` that have a logarithm: what is 0 or infinite is switched off, and stays so."""
+    return [name for name, value in gains._asdict().items() if 0.0 < value < math.inf]
+
+
+def tuned(given: Any, values: np.ndarray) -> Any:
+    """`given` with `values` (k,) of what is `searched`."""
+    return given._replace(**dict(zip(searched(given), map(float, values), strict=True)))
+
+
 def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """`costs_of` `mpc` with the tunings `sets` (S, k), on teams."""
     runs: tuple[list[list[Metrics]], ...] = tuple([[] for _ in sets] for _ in CONDITIONS)
     for config, drawn in of_teams():
         flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn]
-        laws = [type("Tuned", (Mpc,), {"team_tuning": MpcTuning(*map(float, values))})(config) for values in sets]
+        laws = [type("Tuned", (Mpc,), {"team_tuning": tuned(Mpc.team_tuning, values)})(config) for values in sets]
         flown = simulate_batch(config, [(Baseline(law, config), flights) for law in laws], "newton-euler")
         limit, most = config.scenario.termination_distance, rotor_limits(config.plant, flights * len(sets))
         found = iter(measure_batch(flown, limit, most, config.plant.leader))
@@ -152,7 +161,7 @@ def costs(law: Any, sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.nda
 def costs_of_mpc(values: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """`costs_of` `mpc` with the tuning `values` (k,)."""
     config = preset("paper")
-    law = type("Tuned", (Mpc,), {"tuning": MpcTuning(*map(float, values))})(config)
+    law = type("Tuned", (Mpc,), {"tuning": tuned(Mpc.tuning, values)})(config)
     return costs_of(law, from_rest(config), 1, ALLOWED[law.name])
 
 
@@ -204,7 +213,7 @@ def main() -> None:
     law = TUNED[options.law]
     team = options.law == "mpc-team"
     given = law.team_tuning if team else law.tuning if law is Mpc else law.gains
-    start = np.log(np.array(given, float))
+    start = np.log([getattr(given, name) for name in searched(given)])
     if team:
         best, least = minimise(
             lambda sets: costs_of_team(np.exp(sets))[0], start, options.width, options.sets, options.rounds
@@ -220,7 +229,7 @@ def main() -> None:
             lambda sets: costs(law, np.exp(sets))[0], start, options.width, options.sets, options.rounds
         )
         shown = costs(law, np.exp([best]))[1]
-    gains = dict(zip(given._fields, np.exp(best).tolist(), strict=True))
+    gains = dict(zip(searched(given), np.exp(best).tolist(), strict=True))
     rounded = [{key: round(float(np.ravel(value)[0]), 3) for key, value in one.items()} for one in shown]
     found = {"law": options.law, "gains": gains, "cost": least, "medians": rounded}
     print(json.dumps(found))

@@ -10,10 +10,9 @@ from collections.abc import Callable
 
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
-from mjxball.baselines.lqg import KnownFailuresLqg, Lqg, Memoryless, SlowLqg
+from mjxball.baselines.lqg import KnownFailuresLqg, Lqg, Memoryless, OffsetFree, SlowLqg
 from mjxball.baselines.mpc import Mpc
 from mjxball.baselines.observer import Observer
-from mjxball.baselines.offset_free import OffsetFree
 from mjxball.baselines.pid import Pid
 from mjxball.baselines.reference import Oracle, Random, Stay
 from mjxball.baselines.team_lqg import TeamOffsetFree

@@ -6,17 +6,17 @@ Every quantity is a deviation from the level hover at the goal; angles and torqu
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball.arrays import Array, matmul
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
-from mjxball.baselines.lqg_design import discretise
+from mjxball.baselines.linear import Filter, discretise, kalman, regulator
 from mjxball.config import Config, ball_limit
 from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.followers import PrivilegedInfo
-from mjxball.control.observation import ERROR, ERROR_RATE
 from mjxball.errors import InputError
 
 # What costs 1: states and the follower's commands in their units, and the commands' change in a second.
@@ -27,8 +27,15 @@ CHANGES = (2.0, 20.0)  # [rad/s], [m/s3]
 # Intensities of the noise that drives a state, as a deviation after one second.
 PROCESS_NOISE = {"load_rate": 0.2, "load": 1e-3, "lift": 0.02, "rate": 0.1, "vy": 0.1, "climb": 0.1}
 ROLLING_NOISE = 2e-3  # of `load_rate` where a ball that rolls by itself is part of the model
-# Standard deviations of the measurements.
-MEASUREMENT_NOISE = {"y": 3e-3, "vy": 2e-2, "roll": 5e-3, "rate": 2e-2, "height": 3e-3, "climb": 2e-2}
+# Of what is measured: the place in an observation, its sign, the standard deviation.
+MEASURED = {
+    "y": (13, -1.0, 3e-3),
+    "vy": (16, -1.0, 2e-2),
+    "roll": (3, 1.0, 5e-3),
+    "rate": (9, 1.0, 2e-2),
+    "height": (14, -1.0, 3e-3),
+    "climb": (17, -1.0, 2e-2),
+}
 ERROR_LIMIT = 0.1  # largest error that the feedback acts on [m]
 DELAY = 0.03  # of the sensors, added to the rotors' lag [s]
 STATES = (
@@ -47,7 +54,6 @@ STATES = (
     "load_rate",  # its rate [N m/s]
     "lift",  # disturbance force: weight and rotors other than believed [N]
 )
-MEASURED = ("y", "vy", "roll", "rate", "height", "climb")
 LATERAL = ("y", "vy")  # what a stand locks
 LOAD_DECAY, LOAD_RATE_DECAY = 0.02, 1.0  # assumed decay of a load or lift, and of a load's rate [1/s]
 ROLLING = 5 / 7  # acceleration of a rolling ball over that of a sliding one
@@ -62,7 +68,7 @@ class LinearModel(NamedTuple):
     rate_integral_limit: float  # [rad]
     load_limit: float  # [N m]
 
-    def indices(self, names: tuple[str, ...]) -> list[int]:
+    def indices(self, names: Iterable[str]) -> list[int]:
         """Indices in x of those of `names` that the model has."""
         return [self.names.index(name) for name in names if name in self.names]
 
@@ -116,19 +122,9 @@ def linear_model(config: Config, delay: float) -> LinearModel:
 class State(NamedTuple):
     """State of the controller."""
 
-    estimate: Array  # (..., n) states of the model
+    expected: Array  # (..., n) states of the model, see `Filter`
     command: Array  # (..., 2) last roll [rad] and vertical acceleration [m/s2]
     integral: Any  # (..., 3) see `CopiedPid`
-    started: Array  # (...) 1 after the first step
-
-
-class Design(NamedTuple):
-    """x <- A x + B u, x <- x + L (y - C x), u <- u - K (x, u)."""
-
-    transition: np.ndarray  # (n, n)
-    drive: np.ndarray  # (n, 2)
-    gain: np.ndarray  # (n, m) of the filter
-    feedback: np.ndarray  # (2, n + 2) change of the commands in one control period
 
 
 class CrazyflieLqg:
@@ -142,9 +138,10 @@ class CrazyflieLqg:
             raise InputError("follower 'lqg' flies two Crazyflies along y, free or on the stand with height free")
         self._assembly = assembly_model(config, self.name)
         self._model = linear_model(config, DELAY)
-        self._design = design(self._model, config.timing.control_period)
+        self._filter, self._change = design(self._model, config.timing.control_period)
         self._pid = CopiedPid(config)
-        self._measured_rows = [MEASURED.index(name) for name in MEASURED if name in self._model.names]
+        places, self._signs, _ = np.array([MEASURED[name] for name in MEASURED if name in self._model.names]).T
+        self._shown = places.astype(int)
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         limits = self._model.rate_integral_limit, self._model.load_limit
         self._state_bounds = self._bounds(("rate_integral", "load"), limits)
@@ -152,37 +149,28 @@ class CrazyflieLqg:
 
     def start(self, observation: Array) -> State:
         """See `Law.start`."""
-        xp = observation.__array_namespace__()
-        zero = xp.zeros_like(observation[..., 0])
-        measured, names = self._measured(observation), self._model.names
-        rows = self._model.indices(MEASURED)
-        estimate = [measured[..., rows.index(k)] if k in rows else zero for k in range(len(names))]
-        return State(xp.stack(estimate, axis=-1), xp.stack([zero, zero], axis=-1), self._pid.start(observation), zero)
+        zero = observation.__array_namespace__().zeros_like(observation[..., :2])
+        return State(self._filter.start(self._measured(observation)), zero, self._pid.start(observation))
 
     def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
         """See `Law.step`."""
         xp = observation.__array_namespace__()
-        transition, drive, gain, feedback = (xp.asarray(part, dtype=observation.dtype) for part in self._design)
-        predicted = matmul(state.estimate, transition.T) + matmul(state.command, drive.T)
-        predicted = xp.where(state.started[..., None] > 0, predicted, state.estimate)
-        expected = xp.stack([predicted[..., k] for k in self._model.indices(MEASURED)], axis=-1)
-        estimate = _clip(predicted + matmul(self._measured(observation) - expected, gain.T), self._state_bounds)
+        estimate = self._filter.corrected(state.expected, self._measured(observation))
+        estimate = _clip(estimate, self._state_bounds)
         near = _clip(estimate, self._error_bounds)  # the motors have little to spare for a far goal
-        change = -matmul(xp.concat([near, state.command], axis=-1), feedback.T)
+        gains = xp.asarray(self._change, dtype=observation.dtype)
+        change = -matmul(xp.concat([near, state.command], axis=-1), gains.T)
         command = _clip(state.command + change, self._limits)
         integral, copied = self._pid.step(state.integral, observation)
         vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
         vertical = _clip(vertical, self._limits[1])
         sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
-        return State(estimate, command, integral, xp.ones_like(state.started)), sent
+        return State(self._filter.moved(estimate, command), command, integral), sent
 
     def _measured(self, observation: Array) -> Array:
         """What the filter measures, (..., m)."""
-        xp = observation.__array_namespace__()
-        error, error_rate = observation[..., ERROR], observation[..., ERROR_RATE]
-        every: tuple[Array, ...] = (-error[..., 1], -error_rate[..., 1], observation[..., 3], observation[..., 9])
-        every = (*every, -error[..., 2], -error_rate[..., 2])
-        return xp.stack([every[k] for k in self._measured_rows], axis=-1)
+        signs = observation.__array_namespace__().asarray(self._signs, dtype=observation.dtype)
+        return signs * observation[..., self._shown]
 
     def _bounds(self, names: tuple[str, ...], limits: Any) -> np.ndarray:
         """(n,) the `limits` of the states `names` that the model has, infinite for the others."""
@@ -197,18 +185,14 @@ def _clip(array: Array, limit: Any) -> Array:
     return xp.clip(array, -bound, bound)
 
 
-def design(model: LinearModel, period: float) -> Design:
-    """Filter and feedback for the control period [s]."""
+def design(model: LinearModel, period: float) -> tuple[Filter, np.ndarray]:
+    """(filter, (2, n + 2) K of a command's change -K (x, u)) for the control period [s]."""
     n, names = len(model.names), model.names
     transition, drive = discretise(model.a, model.b, period)
     rolls = bool(np.isfinite(model.load_limit))
     deviations = PROCESS_NOISE | ({"load_rate": ROLLING_NOISE} if rolls else {})
-    process_noise = np.diag([deviations.get(name, 0.0) ** 2 * period for name in names])
-    rows = model.indices(MEASURED)
-    measurement_noise = np.diag([MEASUREMENT_NOISE[names[k]] ** 2 for k in rows])
-    measured = np.eye(n)[rows]
-    predicted = riccati(transition.T, measured.T, process_noise, measurement_noise)
-    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
+    walks = {place: deviations.get(name, 0.0) ** 2 for place, name in enumerate(names)}
+    noise = {place: MEASURED[names[place]][2] for place in model.indices(MEASURED)}
 
     a, b = np.eye(n + 2), np.zeros((n + 2, 2))
     a[:n, :n], a[:n, n:] = transition, drive
@@ -219,23 +203,5 @@ def design(model: LinearModel, period: float) -> Design:
     outputs.append((unit[names.index("leader_thrust")] - unit[names.index("follower_thrust")]) / THRUST_DIFFERENCE)
     outputs.append(unit[n] / TILT)
     cost = np.array(outputs).T @ np.array(outputs)
-    effort = np.diag([(limit * period) ** -2 for limit in CHANGES])
-    value = riccati(a, b, cost, effort)
-    return Design(transition, drive, gain, np.linalg.solve(effort + b.T @ value @ b, b.T @ value @ a))
-
-
-def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """P (n, n) = A'PA - A'PB (R + B'PB)^-1 B'PA + Q, by structure-preserving doubling.
-
-    Not `scipy.linalg.solve_discrete_are`: on the stand the leader's rate integral and the ball's torque conserve a sum
-    that no command moves (an eigenvalue of 1), so there is no stabilising solution to a solver of eigenvalues. SciPy's
-    feedback is then off by 9e-4, and with a decay of 1e-5 1/s it fails; doubling converges to the least cost.
-    """
-    eye, a, g, h = np.eye(len(a)), a.copy(), b @ np.linalg.solve(r, b.T), q.copy()
-    for _ in range(60):
-        w = np.linalg.inv(eye + g @ h)
-        step = a.T @ h @ w @ a
-        a, g, h = a @ w @ a, g + a @ w @ g @ a.T, h + step
-        if np.abs(step).max() <= 1e-12 * np.abs(h).max():
-            break
-    return 0.5 * (h + h.T)
+    change, _ = regulator(a, b, cost, np.diag([(limit * period) ** -2 for limit in CHANGES]))
+    return kalman(transition, drive, period, walks, noise), change

@@ -32,21 +32,8 @@ from typing import Any
 import numpy as np
 
 from mjxball.arrays import Array
-from mjxball.baselines.mpc_design import (
-    LIFT,
-    MEASURED,
-    NAME,
-    PITCH,
-    PITCH_RATE,
-    ROLL,
-    ROLL_RATE,
-    TEAM,
-    Design,
-    Limits,
-    MpcTuning,
-    design,
-    limits_of,
-)
+from mjxball.baselines.motion import LIFT, PITCH, PITCH_RATE, ROLL, ROLL_RATE
+from mjxball.baselines.mpc_design import MEASURED, NAME, PAIR, TEAM, Design, Limits, design, limits_of
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
@@ -152,7 +139,7 @@ class Mpc:
 
     name = NAME
     needs_privileged = False
-    tuning, team_tuning = MpcTuning(), TEAM
+    tuning, team_tuning = PAIR, TEAM
     delay = 1  # control steps by which measurements are taken to be late
 
     def __init__(self, config: Config):

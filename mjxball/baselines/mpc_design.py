@@ -5,14 +5,32 @@ Body axes. All N - 1 followers are taken to send the command of the one that pla
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import AssemblyModel, ideal_model, pair_model
-from mjxball.baselines.lqg_design import RATE_NOISE, TILT, VERTICAL, discretise, steady_gain
+from mjxball.baselines.linear import discretise, kalman, regulator
+from mjxball.baselines.motion import (
+    AXES,
+    EX,
+    EY,
+    EZ,
+    LIFT,
+    LIFT_ERROR,
+    PAIR_INERTIA,
+    STATES,
+    TILT,
+    VERTICAL,
+    VX,
+    VY,
+    VZ,
+    Noise,
+    Tuning,
+    motion,
+)
 from mjxball.config import Config
 from mjxball.control import mixer
 from mjxball.errors import InputError
@@ -22,46 +40,29 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 NAME = "mpc"
-STATES, TEAM_STATES = 16, 18
-# Places in the state. Along x: error [m], its rate [m/s], pitch [rad], its rate [rad/s], torque of the rotors [N m], of
-# the load [N m], and its rate [N m/s]; along y the same about roll, without a load.
-EX, VX, PITCH, PITCH_RATE, TORQUE, LOAD, LOAD_RATE = range(7)
-EY, VY, ROLL, ROLL_RATE, ROLLING = range(7, 12)
-# Error of the height [m], its rate [m/s], lift and error of the lift [m/s2].
-EZ, VZ, LIFT, LIFT_ERROR = range(12, STATES)
-ROLL_LOAD, ROLL_LOAD_RATE = range(STATES, TEAM_STATES)  # of teams: as LOAD and LOAD_RATE, about roll
-ERROR_NOISE, VELOCITY_NOISE, ANGLE_NOISE = 3e-3, 1.4e-2, 5e-3  # deviations of a measurement [m], [m/s], [rad]
-MEASURED = {  # deviation of what is measured, by its place
-    **{EX: ERROR_NOISE, VX: VELOCITY_NOISE, PITCH: ANGLE_NOISE, PITCH_RATE: RATE_NOISE},
-    **{EY: ERROR_NOISE, VY: VELOCITY_NOISE, ROLL: ANGLE_NOISE, ROLL_RATE: RATE_NOISE},
-    **{EZ: ERROR_NOISE, VZ: VELOCITY_NOISE},
-}
-PAIR_INERTIA = 0.0644  # of the pair about pitch, for which `MpcTuning.torque_walk` is [kg m2]
-# Axis, torque of the rotors, of the load and its rate.
-LOADS = ((1, TORQUE, LOAD, LOAD_RATE), (0, ROLLING, ROLL_LOAD, ROLL_LOAD_RATE))
+PAIR_STATES = STATES - 2  # no load about roll
+NOISE = Noise(velocity=1.4e-2, angle=5e-3)
+MEASURED = NOISE.of(range(STATES))  # deviation of what is measured, by its place
 MEMORY = 10.0  # in which one of several followers forgets the load's torque and the error of the lift [s]
 ALIKE = 1e-6  # by which drones of a team may differ
 SPARE = 0.04  # share of a rotor's largest force that is left to yaw and to what is not linear
 
 
-class MpcTuning(NamedTuple):
-    """What is chosen of `mpc`; intensities are of the white noise that drives a state."""
-
-    position: float = 0.161  # that costs 1 [m]
-    velocity: float = 0.481  # that costs 1 [m/s]
-    height: float = 0.225  # that costs 1 [m]
-    climb: float = 0.604  # that costs 1 [m/s]
-    torque_walk: float = 0.931  # of the rate of the load's torque [(N m/s)2/s]
-    lift_walk: float = 0.011  # of the error of the lift [(m/s2)2/s]
-    acceleration_walk: float = 0.007  # of every velocity [(m/s)2/s]
-    turn_walk: float = 0.014  # of roll and pitch rate [(rad/s)2/s]
-    load_time: float = 0.687  # in which the filter forgets the rate of the load's torque [s]
-    forecast_time: float = 0.26  # in which that rate dies out in the plan [s]
-    tilt_limit: float = 0.18  # of the assembly, as planned [rad]
-    lift_limit: float = 2.894  # likewise [m/s2]
-
-
-TEAM = MpcTuning(
+PAIR = Tuning(
+    position=0.161,
+    velocity=0.481,
+    height=0.225,
+    climb=0.604,
+    torque_walk=0.931,
+    lift_walk=0.011,
+    acceleration_walk=0.007,
+    turn_walk=0.014,
+    rate_time=0.687,
+    forecast_time=0.26,
+    tilt_limit=0.18,
+    lift_limit=2.894,
+)
+TEAM = Tuning(
     position=0.183,
     velocity=0.605,
     height=0.174,
@@ -70,7 +71,7 @@ TEAM = MpcTuning(
     lift_walk=0.01,
     acceleration_walk=0.007,
     turn_walk=0.013,
-    load_time=0.233,
+    rate_time=0.233,
     forecast_time=0.217,
     tilt_limit=0.175,
     lift_limit=3.569,
@@ -117,36 +118,33 @@ def known_model(config: Config) -> AssemblyModel:
     return model
 
 
-def design(config: Config, tuning: MpcTuning, mass: float) -> Design:
+def design(config: Config, tuning: Tuning, mass: float) -> Design:
     """The law for the plant of `config` with an object of `mass` [kg]; InputError as of `known_model`."""
-    model, levers = known_model(config), _levers(known_model(config), mass)
-    size, scales = (TEAM_STATES, model.inertia) if config.plant.is_team else (STATES, (0.0, PAIR_INERTIA))
+    nominal = known_model(config)
+    model, levers = _with_object(config, nominal, mass), _levers(nominal, mass)
+    roll, pitch = nominal.inertia
+    team = config.plant.is_team
+    scale, size = ((roll / PAIR_INERTIA, pitch / PAIR_INERTIA), STATES) if team else ((0.0, 1.0), PAIR_STATES)
     # The motion shows the sum alone of what followers estimate: what each kept for good would drift apart.
-    forgets = 1.0 / MEMORY if model.followers > 1 else 0.0
-    a, b = _motion(config, model, mass, levers)
-    filtering, planning = a.copy(), a.copy()
-    filtering[LIFT_ERROR, LIFT_ERROR] = -forgets
-    walks = {LIFT_ERROR: tuning.lift_walk}
-    for axis, _, load, rate in LOADS:
-        filtering[load, load], filtering[rate, rate] = -forgets, -1.0 / tuning.load_time
-        planning[rate, rate] = -1.0 / tuning.forecast_time
-        walks[rate] = tuning.torque_walk * (scales[axis] / PAIR_INERTIA) ** 2
-    walks |= dict.fromkeys((VX, VY, VZ), tuning.acceleration_walk)
-    walks |= dict.fromkeys((PITCH_RATE, ROLL_RATE), tuning.turn_walk)
-    (open_loop, drive), (planned, _) = (discretise(each, b, model.period) for each in (filtering, planning))
+    memory = MEMORY if model.followers > 1 else math.inf
+    filtering = motion(model, tuning._replace(load_time=memory, lift_time=memory))
+    planning = motion(model, tuning._replace(rate_time=tuning.forecast_time))
+    (open_loop, drive), (planned, _) = (discretise(*each, model.period) for each in (filtering, planning))
+    of_leader, of_followers = (drive @ asked for asked in _asked(model, levers))
     led = _leaders_command(config)
-    transition = (open_loop + drive[:, :3] @ led)[:size, :size]
-    mean, cost = _regulators(open_loop, drive[:, :3] + drive[:, 3:6], tuning)
-    far = np.zeros((3, TEAM_STATES))
+    transition = (open_loop + of_leader @ led)[:size, :size]
+    mean, cost = _regulators(open_loop, of_leader + of_followers, tuning)
+    far = np.zeros((3, STATES))
     for row, states in enumerate(([EY, VY], [EX, VX], [EZ, VZ])):
         far[row, states] = mean[row, states]
-    feedback, correction = _followers_command(model, _about_target(model, mean, forgets), led, levers)
+    feedback, correction = _followers_command(model, _about_target(model, mean, 1.0 / memory), led, levers)
+    walks = {state: walk for state, walk in tuning.walks(scale).items() if state < size}
     return Design(
         transition=transition,
-        forecast=(planned + drive[:, :3] @ led)[:size, :size],
-        drive=drive[:size, 3:6],
-        torque_drive=drive[:size, 6:],
-        gain=steady_gain(transition, model.period, {k: v for k, v in walks.items() if k < size}, MEASURED),
+        forecast=(planned + of_leader @ led)[:size, :size],
+        drive=of_followers[:size],
+        torque_drive=drive[:size, :2],
+        gain=kalman(transition, of_followers[:size], model.period, walks, MEASURED).gain,
         feedback=feedback[:, :size],
         correction=correction,
         cost=cost,
@@ -154,6 +152,26 @@ def design(config: Config, tuning: MpcTuning, mass: float) -> Design:
         far=far[:, :size],
         far_limit=np.array([tuning.tilt_limit, tuning.tilt_limit, tuning.lift_limit]),
     )
+
+
+def _with_object(config: Config, model: AssemblyModel, mass: float) -> AssemblyModel:
+    """`model` with an object of `mass` [kg] in place of the plant's."""
+    per_mass = plant_parameters(config.plant, config.attitude).object_inertia_per_mass
+    roll, pitch = np.array(model.inertia) + (mass - config.plant.object_mass) * np.asarray(per_mass)[:2]
+    return model._replace(inertia=(float(roll), float(pitch)))
+
+
+def _asked(model: AssemblyModel, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(3, 3) each: what the leader's command, and all followers', ask for, as the u of `motion`; `levers` of `_levers`.
+
+    An uneven lift turns as well.
+    """
+    count, found = len(model.own_mass), []
+    for drones, lever in zip((1, count - 1), levers, strict=True):
+        asked = drones * np.diag([*model.kp, 1.0 / count])
+        asked[:2, 2] = lever
+        found.append(asked)
+    return found[0], found[1]
 
 
 def _levers(model: AssemblyModel, mass: float) -> np.ndarray:
@@ -169,7 +187,7 @@ def _about_target(model: AssemblyModel, mean: np.ndarray, forgets: float) -> np.
     the filter forgets, and the followers' estimates drift apart.
     """
     mean, ahead = mean.copy(), model.lag + 0.5 * model.period
-    for axis, torque, load, rate in LOADS:
+    for axis, (*_, torque, load, rate) in enumerate(AXES):
         held = 1.0 / len(model.own_mass) / model.kp[axis]
         mean[axis, load] += mean[axis, torque] - held * (1.0 - forgets * ahead)
         mean[axis, rate] -= held * ahead
@@ -190,56 +208,30 @@ def _followers_command(
     return feedback, correction
 
 
-def _motion(config: Config, model: AssemblyModel, mass: float, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(a (18, 18), b (18, 8)) of x' = a x + b (leader's command, followers', roll and pitch torque).
-
-    `levers` as of `_levers`. The rates of the load's torques stay as they are.
-    """
-    a, b, count = np.zeros((TEAM_STATES, TEAM_STATES)), np.zeros((TEAM_STATES, 8)), len(model.own_mass)
-    more = (mass - config.plant.object_mass) * plant_parameters(config.plant, config.attitude).object_inertia_per_mass
-    for axis, sign, (error, velocity, angle, rate, torque), (load, growth) in (
-        (0, 1.0, (EY, VY, ROLL, ROLL_RATE, ROLLING), (ROLL_LOAD, ROLL_LOAD_RATE)),
-        (1, -1.0, (EX, VX, PITCH, PITCH_RATE, TORQUE), (LOAD, LOAD_RATE)),
-    ):
-        kp, kd = model.kp[axis], model.kd[axis]
-        a[error, velocity] = a[angle, rate] = a[load, growth] = 1.0
-        a[velocity, angle] = sign * model.gravity
-        a[rate, [torque, load]] = 1.0, 1.0
-        a[rate] /= model.inertia[axis] + more[axis]
-        a[torque, [angle, rate, torque]] = np.array([-count * kp, -count * kd, -1.0]) / model.lag
-        b[torque, [axis, 3 + axis, 6 + axis]] = np.array([kp, (count - 1) * kp, 1.0]) / model.lag
-        b[torque, [2, 5]] = levers[:, axis] / model.lag
-    a[EZ, VZ], a[VZ, [LIFT, LIFT_ERROR]], a[LIFT, LIFT] = 1.0, -1.0, -1.0 / model.lag
-    b[LIFT, [2, 5]] = np.array([1, count - 1]) / count / model.lag
-    return a, b
-
-
 def _leaders_command(config: Config) -> np.ndarray:
     """(3, 18) what the leader's PD law commands."""
-    led, g = np.zeros((3, TEAM_STATES)), config.plant.gravity
+    led, g = np.zeros((3, STATES)), config.plant.gravity
     kp, kd = (np.broadcast_to(gain, 3) for gain in (config.leader.kp, config.leader.kd))
     led[0, [EY, VY]], led[1, [EX, VX]] = np.array([-kp[1], -kd[1]]) / g, np.array([kp[0], kd[0]]) / g
     led[2, [EZ, VZ]] = kp[2], kd[2]
     return led
 
 
-def _regulators(open_loop: np.ndarray, drive: np.ndarray, tuning: MpcTuning) -> tuple[np.ndarray, np.ndarray]:
+def _regulators(open_loop: np.ndarray, drive: np.ndarray, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """(mean commands (3, 18) of the LQRs of roll, pitch and height, what a correction of each costs (3,)).
 
     `drive` (18, 3) of the mean of all drones' commands.
     """
-    mean, cost = np.zeros((3, TEAM_STATES)), np.zeros(3)
+    mean, cost = np.zeros((3, STATES)), np.zeros(3)
     tilt, height = (tuning.position, tuning.velocity), (tuning.height, tuning.climb)
-    for row, states, weights, most in (
-        (0, [EY, VY, ROLL, ROLL_RATE, ROLLING], tilt, TILT),
-        (1, [EX, VX, PITCH, PITCH_RATE, TORQUE], tilt, TILT),
-        (2, [EZ, VZ, LIFT], height, VERTICAL),
-    ):
-        a, b, q = open_loop[np.ix_(states, states)], drive[states, row][:, None], np.zeros(len(states))
+    axes = [(axis[:5], tilt, TILT) for axis in AXES]
+    for row, (states, weights, most) in enumerate([*axes, ((EZ, VZ, LIFT), height, VERTICAL)]):
+        q = np.zeros(len(states))
         q[:2] = np.array(weights) ** -2.0
-        ahead = solve_discrete_are(a, b, np.diag(q), [[most**-2]])
-        cost[row] = most**-2 + (b.T @ ahead @ b).item()
-        mean[row, states] = -(b.T @ ahead @ a)[0] / cost[row]
+        gains, price = regulator(
+            open_loop[np.ix_(states, states)], drive[states, row][:, None], np.diag(q), np.array([[most**-2]])
+        )
+        mean[row, states], cost[row] = -gains[0], price.item()
     return mean, cost
 
 

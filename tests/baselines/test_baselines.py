@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from mjxball.baselines import LAWS, lqg, lqg_design, make_baseline, make_law
+from mjxball.baselines import LAWS, linear, lqg, make_baseline, make_law
 from mjxball.baselines.assembly_model import assembly_model, ideal_model
+from mjxball.baselines.motion import Noise, disturbance_filter, position_gains
 from mjxball.config import preset, replace
 from mjxball.control.followers import copy_gains
 from mjxball.control.observation import ERROR_RATE, copy_command
@@ -93,15 +94,15 @@ def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]
     values, vectors = np.linalg.eig(np.block([[a, -b @ b.T / r], [-q, -a.T]]))
     stable = vectors[:, values.real < 0]
     cost = np.real(stable[4:] @ np.linalg.inv(stable[:4]))
-    np.testing.assert_allclose(lqg_design.feedback(plant, law.tuning).pitch, (b.T @ cost / r)[0], rtol=1e-9)
+    np.testing.assert_allclose(position_gains(plant, law.tuning)[1], (b.T @ cost / r)[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("walk", [9.0, 0.003])
 def test_filter_is_the_fixed_point_of_the_kalman_recursion(walk: float) -> None:
     plant = ideal_model(preset("paper"), "lqg")
-    found = lqg_design.kalman(plant, 1, walk)
+    found, _ = disturbance_filter(plant, (1,), lqg.QUICK._replace(torque_walk=walk), Noise())
     noise, measured, covariance = np.zeros((5, 5)), np.eye(2, 5), np.eye(5)
-    noise[3, 3] = walk * plant.period
+    noise[4, 4] = walk * plant.period
     for _ in range(3000):
         predicted = found.transition @ covariance @ found.transition.T + noise
         innovation = measured @ predicted @ measured.T + np.diag([2e-3**2, 2e-2**2])
@@ -121,7 +122,7 @@ def test_sampled_model_is_the_integrated_one() -> None:
         k3 = a @ (end + step / 2 * k2) + b @ u
         k4 = a @ (end + step * k3) + b @ u
         end = end + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    transition, drive = lqg_design.discretise(a, b, 0.02)
+    transition, drive = linear.discretise(a, b, 0.02)
     np.testing.assert_allclose(transition @ x + drive @ u, end, rtol=1e-11)
 
 

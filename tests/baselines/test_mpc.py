@@ -15,29 +15,23 @@ from tables import rows
 
 from mjxball import config as configs
 from mjxball.baselines import make_baseline, make_law
-from mjxball.baselines.lqg_design import TILT
-from mjxball.baselines.mpc import BEYOND, BLOCKS, MASSES, Mpc, Program, limit_rows
-from mjxball.baselines.mpc_design import (
+from mjxball.baselines.motion import (
     EX,
     EY,
     LOAD,
-    MEASURED,
-    MEMORY,
     PITCH,
     PITCH_RATE,
     ROLL,
     ROLL_LOAD,
     ROLL_RATE,
     ROLLING,
-    STATES,
+    TILT,
     TORQUE,
     VX,
     VY,
-    Design,
-    MpcTuning,
-    design,
-    limits_of,
 )
+from mjxball.baselines.mpc import BEYOND, BLOCKS, MASSES, Mpc, Program, limit_rows
+from mjxball.baselines.mpc_design import MEASURED, MEMORY, PAIR_STATES, Design, design, limits_of
 from mjxball.config import Config, preset, with_plant
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import mount_angles
@@ -56,8 +50,8 @@ NOMINAL = MASSES.index(0.2)
 HOVER = np.array([1.1 * 9.81 / 4])  # [N] of each rotor, with 0.2 kg
 
 
-def law(tuning: MpcTuning = TUNING) -> Design:
-    return design(PAPER, tuning, MASSES[NOMINAL])
+def law() -> Design:
+    return design(PAPER, TUNING, MASSES[NOMINAL])
 
 
 def cost(own: Design, x: np.ndarray, corrections: np.ndarray) -> float:
@@ -75,7 +69,7 @@ def cost(own: Design, x: np.ndarray, corrections: np.ndarray) -> float:
 def test_a_correction_costs_its_square_on_top_of_the_lqr() -> None:
     """J = x'Px + sum of W v^2: without limits the best v is none, and the law the LQR."""
     own, random = law(), np.random.default_rng(0)
-    x, corrections = np.zeros(STATES), 0.1 * random.normal(size=20)
+    x, corrections = np.zeros(PAIR_STATES), 0.1 * random.normal(size=20)
     x[[EX, VX, PITCH]] = 0.4, -0.2, 0.05
     more = cost(own, x, corrections) - cost(own, x, np.zeros(0))
     assert more == pytest.approx(own.cost[1] * (corrections**2).sum(), rel=1e-6)
@@ -135,7 +129,7 @@ def test_the_program_is_solved_as_another_solver_does() -> None:
     weights = np.outer(BLOCKS, own.cost).ravel()
     scaled = np.maximum(np.linalg.norm(rows / np.sqrt(weights), axis=1), 1e-3)
     for _ in range(5):
-        x = np.zeros(STATES)
+        x = np.zeros(PAIR_STATES)
         x[[EX, VX, PITCH, LOAD]] = random.uniform(-1, 1, 4) * (1.0, 0.5, 0.1, 0.2)
         taken = states @ x + HOVER[0] * lifting
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjxball.baselines import crazyflie_lqg, lqg_design, make_baseline, make_law
+from mjxball.baselines import crazyflie_lqg, linear, make_baseline, make_law
 from mjxball.baselines.assembly_model import assembly_model
-from mjxball.baselines.crazyflie_lqg import MEASURED, linear_model
+from mjxball.baselines.crazyflie_lqg import linear_model
 from mjxball.config import apply_overrides, preset, replace
 from mjxball.control import crazyflie
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -86,7 +86,7 @@ def test_model_moves_as_the_simulator(command: tuple[float, float]) -> None:
     scenario = Scenario(mass=0.0175, amplitude=0.0, goal=(0.0, 0.0, 0.0), seconds=1.0)
     state, load, step = start_of(config, [scenario]), load_of(config, [scenario]), make_stepper(config, "newton-euler")
     assert state.rotor_force == pytest.approx(hover_rotor_force(config, load.believed_mass))
-    transition, drive = lqg_design.discretise(model.a, model.b, config.timing.control_period)
+    transition, drive = linear.discretise(model.a, model.b, config.timing.control_period)
     x = np.zeros(len(model.names))
     for _ in range(30):
         known = dict(zip(model.names, x, strict=True))
@@ -108,20 +108,19 @@ def test_riccati_solution_is_that_of_scipy() -> None:
     random = np.random.default_rng(0)
     a, b, root = random.normal(size=(5, 5)), random.normal(size=(5, 2)), random.normal(size=(5, 5))
     q, r = root @ root.T, np.diag([0.5, 2.0])
-    np.testing.assert_allclose(crazyflie_lqg.riccati(a, b, q, r), solve_discrete_are(a, b, q, r), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(linear.riccati(a, b, q, r), solve_discrete_are(a, b, q, r), rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("config", [FLIGHT, STAND], ids=["flight", "stand"])
 def test_filter_and_loop_are_stable(config) -> None:
     model = linear_model(config, crazyflie_lqg.DELAY)
-    design = crazyflie_lqg.design(model, 0.01)
-    n, shown = len(model.names), model.indices(MEASURED)
-    seen = np.eye(n)[shown]
-    error = (np.eye(n) - design.gain @ seen) @ design.transition
+    own, change = crazyflie_lqg.design(model, 0.01)
+    n = len(model.names)
+    error = (np.eye(n) - own.gain @ own.measured) @ own.transition
     # On the stand one mode, a sum that leader and ball conserve, neither grows nor decays.
     assert np.abs(np.linalg.eigvals(error)).max() < 1 + 1e-9
-    whole = np.block([[design.transition, design.drive], [np.zeros((2, n)), np.eye(2)]])
-    closed = whole - np.vstack([design.drive, np.eye(2)]) @ design.feedback
+    whole = np.block([[own.transition, own.drive], [np.zeros((2, n)), np.eye(2)]])
+    closed = whole - np.vstack([own.drive, np.eye(2)]) @ change
     assert np.abs(np.linalg.eigvals(closed)).max() < 1 + 1e-9
 
 

@@ -11,7 +11,7 @@ from tables import rows
 
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
-from mjxball.baselines.team_lqg import TeamOffsetFree, design, team_model
+from mjxball.baselines.team_lqg import TeamOffsetFree, team_model, unit_model
 from mjxball.config import Config, preset
 from mjxball.control.observation import copy_command
 from mjxball.errors import InputError
@@ -70,26 +70,27 @@ def test_what_enters_the_filter_is_the_mean_of_all_commands() -> None:
         law.team = law.team._replace(lever=lever, room=np.array([9.0, 9.0]))
         state = law.start(observation)
         after, own = law.step(state, observation, None)
-        mean, (turning, rising) = (led + 3 * own) / 4, law.estimate(state, observation)
-        assert mean[2] == pytest.approx(law.design.rise @ (observation[14], observation[17]) - rising[2], rel=1e-9)
+        mean, (x, _, lift) = (led + 3 * own) / 4, law.estimate(state, observation)
+        assert mean[2] == pytest.approx(law.gains[2, :2] @ observation[[14, 17]] - lift, rel=1e-9)
         tilts.append(mean[:2] + lever * (own - led)[2])  # with what the lift turns
-        states = [np.append(turning[k], tilts[-1][k]) for k in (0, 1)]
-        expected = [*(law.design.axis @ one for one in states), law.design.height @ np.append(rising, mean[2])]
-        np.testing.assert_allclose(after, np.concatenate(expected), rtol=1e-9)
+        np.testing.assert_allclose(
+            after, law.filter.moved(x, np.array([*law.stiffness * tilts[-1], mean[2]])), rtol=1e-9
+        )
     np.testing.assert_allclose(tilts[1], tilts[0], rtol=1e-9)
 
 
 def test_the_filter_predicts_a_loop_that_turns() -> None:
     """One period from a random state, by the equations of motion integrated in small steps."""
-    config, state, drive = ring(4), np.array([0.02, -0.1, 3.0, 5.0, -2.0]), 0.05
-    law, lag, steps = design(config), config.plant.rotor_lag, 20000
+    config, state, drive = ring(4), np.array([0.02, -0.1, -2.0, 3.0, 5.0]), 0.05
+    law, lag, steps = TeamOffsetFree(config), config.plant.rotor_lag, 20000
     moved, h = state.copy(), config.timing.control_period / 20000
     for _ in range(steps):
-        angle, rate, load, growth, rotors = moved
+        angle, rate, rotors, load, growth = moved
         asked = 100 * (drive - angle) - 18 * rate
-        slope = (rate, load + rotors, growth - load / 3.0, -growth / 0.3, (asked - rotors) / lag)
+        slope = (rate, load + rotors, (asked - rotors) / lag, growth - load / 3.0, -growth / 0.3)
         moved = moved + h * np.array(slope)
-    np.testing.assert_allclose(law.axis @ np.append(state, drive), moved, rtol=1e-4, atol=1e-5)
+    found = law.filter.moved(np.append(state, np.zeros(8)), np.array([law.stiffness * drive, 0.0, 0.0]))
+    np.testing.assert_allclose(found[:5], moved, rtol=1e-4, atol=1e-5)
 
 
 @rows("count", [3, 6])
@@ -100,10 +101,10 @@ def test_it_finds_the_loads_torque(count: int) -> None:
     scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=offset, mass=mass, seconds=12.0)
     flown = simulate(config, follower, scenario, ENGINE)
     assert np.abs(flown.error[-1]).max() < 5e-3
-    turning, _ = follower.law.estimate(follower._state, flown.observation[-1])
+    _, load, _ = follower.law.estimate(follower._state, flown.observation[-1])
     numbers = plant_parameters(config.plant, config.attitude)
     inertia = count * numbers.gains.kp[1] / 100
-    found = np.linalg.norm(turning[0, :, :, 2], axis=-1)
+    found = np.linalg.norm(load[0], axis=-1)
     np.testing.assert_allclose(found, mass * 9.81 * offset / inertia, rtol=0.06)
 
 
@@ -117,4 +118,4 @@ def test_followers_that_measure_apart_do_not_drift_apart() -> None:
 
 def test_loops_that_differ_are_refused() -> None:
     with pytest.raises(InputError, match="alike about roll and pitch"):
-        design(configs.replace(ring(4), "attitude.natural_frequency", (8.0, 10.0, 4.0)))
+        unit_model(configs.replace(ring(4), "attitude.natural_frequency", (8.0, 10.0, 4.0)))

@@ -1,0 +1,143 @@
+"""The linear motion of an assembly with ideal loops, what a law chooses of it, and its filter and position loop.
+
+One motion serves pairs and teams: errors of O and their rates, both tilts with the torque of the rotors and of the
+load, and the lift. A law filters the states that it names. Body axes, or any that are turned about z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.arrays import Array
+from mjxball.baselines.assembly_model import AssemblyModel
+from mjxball.baselines.linear import Filter, continuous_regulator, discretise, kalman
+
+# Places in the state. Along x: error [m], its rate [m/s], pitch [rad], its rate [rad/s], torque of the rotors [N m], of
+# the load [N m], and its rate [N m/s]; along y the same about roll.
+EX, VX, PITCH, PITCH_RATE, TORQUE, LOAD, LOAD_RATE = range(7)
+EY, VY, ROLL, ROLL_RATE, ROLLING = range(7, 12)
+# Error of the height [m], its rate [m/s], lift and error of the lift [m/s2]: what nobody commanded.
+EZ, VZ, LIFT, LIFT_ERROR = range(12, 16)
+ROLL_LOAD, ROLL_LOAD_RATE = range(16, 18)  # as LOAD and LOAD_RATE, about roll
+STATES = 18
+AXES = (  # of roll and pitch, in the order of the first seven
+    (EY, VY, ROLL, ROLL_RATE, ROLLING, ROLL_LOAD, ROLL_LOAD_RATE),
+    (EX, VX, PITCH, PITCH_RATE, TORQUE, LOAD, LOAD_RATE),
+)
+HEIGHT = VZ, LIFT, LIFT_ERROR
+SHOWN = {PITCH: 4, PITCH_RATE: 10, ROLL: 3, ROLL_RATE: 9, VZ: 17}  # place in an observation
+# Of position and velocity, places in an observation: what roll, pitch and lift are for.
+ERRORS, ERROR_RATES = np.array([13, 12, 14]), np.array([16, 15, 17])
+TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
+PAIR_INERTIA = 0.0644  # of the pair about pitch, for which torque walks are [kg m2]
+
+
+class Noise(NamedTuple):
+    """Deviations of a measurement."""
+
+    error: float = 3e-3  # [m]
+    velocity: float = 2e-2  # [m/s]
+    angle: float = 2e-3  # [rad]
+    rate: float = 2e-2  # [rad/s]
+
+    def of(self, states: Iterable[int]) -> dict[int, float]:
+        """By place, of the `states` that are measured."""
+        places = EX, VX, PITCH, PITCH_RATE, EY, VY, ROLL, ROLL_RATE, EZ, VZ
+        every = dict(zip(places, (*self, *self, *self[:2]), strict=True))
+        return {state: every[state] for state in states if state in every}
+
+
+class Tuning(NamedTuple):
+    """What a law chooses: costs, intensities of the white noise that drives a state, memories, limits."""
+
+    position: float  # that costs 1 [m]
+    velocity: float  # that costs 1 [m/s]
+    height: float  # that costs 1 [m]
+    climb: float  # that costs 1 [m/s]
+    torque_walk: float  # of the rate of the load's torque [(N m/s)2/s]
+    lift_walk: float = 0.0  # of the error of the lift [(m/s2)2/s]
+    acceleration_walk: float = 0.0  # of every velocity [(m/s)2/s]
+    turn_walk: float = 0.0  # of roll and pitch rate [(rad/s)2/s]
+    load_time: float = math.inf  # in which the filter forgets the load's torque [s]
+    rate_time: float = math.inf  # and the rate of it [s]
+    lift_time: float = math.inf  # and the error of the lift [s]
+    forecast_time: float = math.inf  # in which the rate of the load's torque dies out in a plan [s]
+    tilt_limit: float = 0.3  # of what position and velocity ask for [rad]
+    lift_limit: float = 2.0  # likewise [m/s2]
+
+    def walks(self, scale: tuple[float, float] = (1.0, 1.0)) -> dict[int, float]:
+        """Intensities by place, those of the load's roll and pitch torque times the squares of `scale`."""
+        found = {LIFT_ERROR: self.lift_walk}
+        for axis, (_, velocity, _, rate, _, _, growth) in enumerate(AXES):
+            found[growth] = self.torque_walk * scale[axis] ** 2
+            found[velocity], found[rate] = self.acceleration_walk, self.turn_walk
+        return found | {VZ: self.acceleration_walk}
+
+
+def motion(model: AssemblyModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
+    """(a (18, 18), b (18, 3)) of x' = a x + b u, for u what all drones' commands together ask for.
+
+    That is roll and pitch torque [N m] and the mean vertical acceleration [m/s2]. Attitude loops and rotors are in a.
+    """
+    a, b = np.zeros((STATES, STATES)), np.zeros((STATES, 3))
+    for axis, (error, velocity, angle, rate, torque, load, growth) in enumerate(AXES):
+        stiffness, damping = (len(model.own_mass) * gain[axis] for gain in (model.kp, model.kd))
+        a[error, velocity] = a[angle, rate] = a[load, growth] = 1.0
+        a[velocity, angle] = (1.0, -1.0)[axis] * model.gravity
+        a[rate, [torque, load]] = 1.0 / model.inertia[axis]
+        a[torque, [angle, rate, torque]] = np.array([-stiffness, -damping, -1.0]) / model.lag
+        b[torque, axis] = 1.0 / model.lag
+        a[load, load], a[growth, growth] = -1.0 / tuning.load_time, -1.0 / tuning.rate_time
+    a[EZ, VZ], a[VZ, [LIFT, LIFT_ERROR]], a[LIFT, LIFT] = 1.0, -1.0, -1.0 / model.lag
+    a[LIFT_ERROR, LIFT_ERROR], b[LIFT, 2] = -1.0 / tuning.lift_time, 1.0 / model.lag
+    return a, b
+
+
+def disturbance_filter(
+    model: AssemblyModel,
+    axes: tuple[int, ...],
+    tuning: Tuning,
+    noise: Noise,
+    scale: tuple[float, float] = (1.0, 1.0),
+) -> tuple[Filter, np.ndarray]:
+    """(the filter of tilts with what turns them and, if its error walks, of the lift; places of y in an observation).
+
+    Its state: for each of `axes` angle, rate, torque of the rotors, of the load, its rate; then climb downwards, lift,
+    error of the lift. Its u as of `motion`; `scale` as of `Tuning.walks`.
+    """
+    states = [state for axis in axes for state in AXES[axis][2:]] + list(HEIGHT) * (tuning.lift_walk > 0.0)
+    shown, (a, b) = [state for state in states if state in SHOWN], motion(model, tuning)
+    walks, deviations = (
+        {states.index(state): value for state, value in values.items() if state in states}
+        for values in (tuning.walks(scale), noise.of(shown))
+    )
+    sampled = discretise(a[np.ix_(states, states)], b[states], model.period)
+    return kalman(*sampled, model.period, walks, deviations), np.array([SHOWN[state] for state in shown])
+
+
+def position_gains(model: AssemblyModel, tuning: Tuning) -> np.ndarray:
+    """(3, 4) feedback on error, its rate, angle and rate, of roll, pitch and height: LQRs about closed loops."""
+    tilt_cost = np.diag([tuning.position**-2, tuning.velocity**-2, 0.0, 0.0])
+    height_cost = np.diag([tuning.height**-2, tuning.climb**-2])
+    found = np.zeros((3, 4))
+    for axis, frequency in enumerate(model.natural_frequency):
+        a = np.zeros((4, 4))
+        a[0, 1] = a[2, 3] = 1.0
+        a[1, 2] = (-1.0, 1.0)[axis] * model.gravity
+        a[3, 2], a[3, 3] = -(frequency**2), -2.0 * model.damping * frequency
+        b = np.array([[0.0], [0.0], [0.0], [frequency**2]])
+        found[axis] = continuous_regulator(a, b, tilt_cost, np.array([[TILT**-2]]))[0]
+    a, b = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    found[2, :2] = continuous_regulator(a, b, height_cost, np.array([[VERTICAL**-2]]))[0]
+    return found
+
+
+def asked(gains: Array, observation: Array) -> tuple[Array, Array]:
+    """What the assembly should do by `position_gains`, (..., 3) each: for position and velocity, and against tilts."""
+    error, rate, angle, turn = observation.__array_namespace__().asarray(gains.T, dtype=observation.dtype)
+    far = error * observation[..., ERRORS] + rate * observation[..., ERROR_RATES]
+    return far, -(angle * observation[..., 3:6] + turn * observation[..., 9:12])
