@@ -12,7 +12,7 @@ import numpy as np
 
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import ideal_model, pair_model
-from mjxball.baselines.motion import PAIR_INERTIA, Noise, Tuning, asked, disturbance_filter, position_gains
+from mjxball.baselines.motion import PAIR_INERTIA, Tuning, asked, disturbance_filter, noise, position_gains
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import copy_command
@@ -150,15 +150,14 @@ class Lqg(Takeover):
     """
 
     name = "lqg"
+    scaled = False  # a load's torque is expected to wander as much as that of the pair, whatever the inertia is
 
     def __init__(self, config: Config):
         super().__init__(config)
-        filtered = disturbance_filter(self._model, self._model.axes, self.tuning, Noise(), self._scale())
-        self._filter, self._shown = filtered
-
-    def _scale(self) -> tuple[float, float]:
-        """How much more than the pair's the load's roll and pitch torque are expected to wander."""
-        return 1.0, 1.0
+        model = self._model
+        roll, pitch = (inertia / PAIR_INERTIA if self.scaled else 1.0 for inertia in model.inertia)
+        found = disturbance_filter(model, model.axes, self.tuning, noise(), (roll, pitch))
+        self._filter, self._shown = found
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
@@ -223,15 +222,12 @@ class KnownRigLqg(KnownFailuresLqg):
     """
 
     name = "lqg-known-rig"
+    scaled = True
 
     def __init__(self, config: Config):
         super().__init__(config)
         numbers, followers = plant_parameters(config.plant, config.attitude), list(config.plant.followers)
         self._rotors = numbers.arm[followers], numbers.rotor_force_max[followers]
-
-    def _scale(self) -> tuple[float, float]:
-        roll, pitch = self._model.inertia
-        return roll / PAIR_INERTIA, pitch / PAIR_INERTIA
 
     def _weighing(self, carried: Array, privileged: PrivilegedInfo) -> Array:
         return self._model.of_flight(privileged.total_mass)

@@ -7,7 +7,7 @@ load, and the lift. A law filters the states that it names. Body axes, or any th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -36,19 +36,10 @@ TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
 PAIR_INERTIA = 0.0644  # of the pair about pitch, for which torque walks are [kg m2]
 
 
-class Noise(NamedTuple):
-    """Deviations of a measurement."""
-
-    error: float = 3e-3  # [m]
-    velocity: float = 2e-2  # [m/s]
-    angle: float = 2e-3  # [rad]
-    rate: float = 2e-2  # [rad/s]
-
-    def of(self, states: Iterable[int]) -> dict[int, float]:
-        """By place, of the `states` that are measured."""
-        places = EX, VX, PITCH, PITCH_RATE, EY, VY, ROLL, ROLL_RATE, EZ, VZ
-        every = dict(zip(places, (*self, *self, *self[:2]), strict=True))
-        return {state: every[state] for state in states if state in every}
+def noise(error: float = 3e-3, velocity: float = 2e-2, angle: float = 2e-3, rate: float = 2e-2) -> dict[int, float]:
+    """Deviation of what is measured, by its place in the state [m], [m/s], [rad], [rad/s]."""
+    along, across = (dict(zip(axis, (error, velocity, angle, rate), strict=False)) for axis in reversed(AXES))
+    return along | across | {EZ: error, VZ: velocity}
 
 
 class Tuning(NamedTuple):
@@ -101,22 +92,22 @@ def disturbance_filter(
     model: AssemblyModel,
     axes: tuple[int, ...],
     tuning: Tuning,
-    noise: Noise,
+    deviations: Mapping[int, float],
     scale: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Filter, np.ndarray]:
     """(the filter of tilts with what turns them and, if its error walks, of the lift; places of y in an observation).
 
     Its state: for each of `axes` angle, rate, torque of the rotors, of the load, its rate; then climb downwards, lift,
-    error of the lift. Its u as of `motion`; `scale` as of `Tuning.walks`.
+    error of the lift. Its u as of `motion`; `deviations` as of `noise`, `scale` as of `Tuning.walks`.
     """
     states = [state for axis in axes for state in AXES[axis][2:]] + list(HEIGHT) * (tuning.lift_walk > 0.0)
-    shown, (a, b) = [state for state in states if state in SHOWN], motion(model, tuning)
-    walks, deviations = (
+    walks, measured = (
         {states.index(state): value for state, value in values.items() if state in states}
-        for values in (tuning.walks(scale), noise.of(shown))
+        for values in (tuning.walks(scale), deviations)
     )
+    a, b = motion(model, tuning)
     sampled = discretise(a[np.ix_(states, states)], b[states], model.period)
-    return kalman(*sampled, model.period, walks, deviations), np.array([SHOWN[state] for state in shown])
+    return kalman(*sampled, model.period, walks, measured), np.array([SHOWN[states[place]] for place in measured])
 
 
 def position_gains(model: AssemblyModel, tuning: Tuning) -> np.ndarray:

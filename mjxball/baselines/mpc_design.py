@@ -27,9 +27,9 @@ from mjxball.baselines.motion import (
     VX,
     VY,
     VZ,
-    Noise,
     Tuning,
     motion,
+    noise,
 )
 from mjxball.config import Config
 from mjxball.control import mixer
@@ -41,8 +41,7 @@ if TYPE_CHECKING:
 
 NAME = "mpc"
 PAIR_STATES = STATES - 2  # no load about roll
-NOISE = Noise(velocity=1.4e-2, angle=5e-3)
-MEASURED = NOISE.of(range(STATES))  # deviation of what is measured, by its place
+MEASURED = noise(velocity=1.4e-2, angle=5e-3)
 MEMORY = 10.0  # in which one of several followers forgets the load's torque and the error of the lift [s]
 ALIKE = 1e-6  # by which drones of a team may differ
 SPARE = 0.04  # share of a rotor's largest force that is left to yaw and to what is not linear

@@ -13,7 +13,7 @@ import numpy as np
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, OffsetFree
-from mjxball.baselines.motion import Noise, asked, disturbance_filter, position_gains
+from mjxball.baselines.motion import asked, disturbance_filter, noise, position_gains
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
@@ -24,7 +24,7 @@ from mjxball.plant import plant_parameters
 
 # Torque walk of a load's torque over the inertia; what followers estimate apart is forgotten.
 TUNING = OffsetFree.tuning._replace(torque_walk=20.0, load_time=3.0, rate_time=0.3, lift_time=5.0)
-NOISE = Noise(angle=5e-3)
+NOISE = noise(angle=5e-3)
 LEAST_ROOM = 1e-3  # [rad]
 
 

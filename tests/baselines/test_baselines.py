@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.baselines import LAWS, linear, lqg, make_baseline, make_law
 from mjxball.baselines.assembly_model import assembly_model, ideal_model
-from mjxball.baselines.motion import Noise, disturbance_filter, position_gains
+from mjxball.baselines.motion import disturbance_filter, noise, position_gains
 from mjxball.config import preset, replace
 from mjxball.control.followers import copy_gains
 from mjxball.control.observation import ERROR_RATE, copy_command
@@ -100,11 +100,11 @@ def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]
 @pytest.mark.parametrize("walk", [9.0, 0.003])
 def test_filter_is_the_fixed_point_of_the_kalman_recursion(walk: float) -> None:
     plant = ideal_model(preset("paper"), "lqg")
-    found, _ = disturbance_filter(plant, (1,), lqg.QUICK._replace(torque_walk=walk), Noise())
-    noise, measured, covariance = np.zeros((5, 5)), np.eye(2, 5), np.eye(5)
-    noise[4, 4] = walk * plant.period
+    found, _ = disturbance_filter(plant, (1,), lqg.QUICK._replace(torque_walk=walk), noise())
+    driven, measured, covariance = np.zeros((5, 5)), np.eye(2, 5), np.eye(5)
+    driven[4, 4] = walk * plant.period
     for _ in range(3000):
-        predicted = found.transition @ covariance @ found.transition.T + noise
+        predicted = found.transition @ covariance @ found.transition.T + driven
         innovation = measured @ predicted @ measured.T + np.diag([2e-3**2, 2e-2**2])
         gain = predicted @ measured.T @ np.linalg.inv(innovation)
         covariance = (np.eye(5) - gain @ measured) @ predicted

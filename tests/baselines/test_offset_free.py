@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mjxball.baselines import make_baseline, make_law
-from mjxball.baselines.assembly_model import ideal_model
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.sim.rollout import simulate
@@ -42,20 +41,6 @@ def test_it_finds_what_a_mass_that_nobody_knows_pulls():
     """The follower lifts it alone, commanding (m - m^) g over the 1.1 kg it believes to lift; half is both's mean."""
     _, lift = estimates(0.3, 0.2, 0.0)
     assert lift == pytest.approx(-0.5 * 0.1 * 9.81 / 1.1, rel=1e-3)
-
-
-def test_the_filter_predicts_a_pair_that_turns_and_climbs():
-    """One period of a constant drive from rest, by the equations of motion integrated in small steps."""
-    pair, law = ideal_model(preset("paper"), "test"), make_law("lqg-offset-free", preset("paper"))
-    state, steps = np.array([0.02, -0.1, 0.01, 0.03, 0.2, -0.3, 0.1, -0.2]), 20000
-    drive, h = np.array([0.0, 0.05, 0.4]), preset("paper").timing.control_period / 20000
-    moved = state.copy()
-    for _ in range(steps):
-        angle, rate, rotors, torque, growth, _sinking, lift, error = moved
-        asked = drive[1] - 2 * pair.kp[1] * angle - 2 * pair.kd[1] * rate
-        slope = (rate, (torque + rotors) / pair.inertia[1], (asked - rotors) / pair.lag, growth, 0.0)
-        moved = moved + h * np.array([*slope, -lift - error, (drive[2] - lift) / pair.lag, 0.0])
-    np.testing.assert_allclose(law._filter.moved(state, drive), moved, atol=2e-6)
 
 
 def test_other_plants_are_refused():

@@ -79,20 +79,6 @@ def test_what_enters_the_filter_is_the_mean_of_all_commands() -> None:
     np.testing.assert_allclose(tilts[1], tilts[0], rtol=1e-9)
 
 
-def test_the_filter_predicts_a_loop_that_turns() -> None:
-    """One period from a random state, by the equations of motion integrated in small steps."""
-    config, state, drive = ring(4), np.array([0.02, -0.1, -2.0, 3.0, 5.0]), 0.05
-    law, lag, steps = TeamOffsetFree(config), config.plant.rotor_lag, 20000
-    moved, h = state.copy(), config.timing.control_period / 20000
-    for _ in range(steps):
-        angle, rate, rotors, load, growth = moved
-        asked = 100 * (drive - angle) - 18 * rate
-        slope = (rate, load + rotors, (asked - rotors) / lag, growth - load / 3.0, -growth / 0.3)
-        moved = moved + h * np.array(slope)
-    found = law.filter.moved(np.append(state, np.zeros(8)), np.array([law.stiffness * drive, 0.0, 0.0]))
-    np.testing.assert_allclose(found[:5], moved, rtol=1e-4, atol=1e-5)
-
-
 @rows("count", [3, 6])
 def test_it_finds_the_loads_torque(count: int) -> None:
     """m g c over the inertia, in every mount frame, less the few percent that is forgotten."""
