@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array, matmul
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
-from mjxball.baselines.linear import Filter, discretise, kalman, regulator
+from mjxball.baselines.linear import Filter, discretise, kalman, regulator, times
 from mjxball.config import Config, ball_limit
 from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.followers import PrivilegedInfo
+from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
 
 # What costs 1: states and the follower's commands in their units, and the commands' change in a second.
@@ -140,8 +141,8 @@ class CrazyflieLqg:
         self._model = linear_model(config, DELAY)
         self._filter, self._change = design(self._model, config.timing.control_period)
         self._pid = CopiedPid(config)
-        places, self._signs, _ = np.array([MEASURED[name] for name in MEASURED if name in self._model.names]).T
-        self._shown = places.astype(int)
+        shown = [MEASURED[name][:2] for name in MEASURED if name in self._model.names]
+        self._shown = np.array([sign * np.eye(OBSERVATION_SIZE)[place] for place, sign in shown])  # y of an observation
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         limits = self._model.rate_integral_limit, self._model.load_limit
         self._state_bounds = self._bounds(("rate_integral", "load"), limits)
@@ -150,27 +151,21 @@ class CrazyflieLqg:
     def start(self, observation: Array) -> State:
         """See `Law.start`."""
         zero = observation.__array_namespace__().zeros_like(observation[..., :2])
-        return State(self._filter.start(self._measured(observation)), zero, self._pid.start(observation))
+        return State(self._filter.start(times(self._shown, observation)), zero, self._pid.start(observation))
 
     def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
         """See `Law.step`."""
         xp = observation.__array_namespace__()
-        estimate = self._filter.corrected(state.expected, self._measured(observation))
+        estimate = self._filter.corrected(state.expected, times(self._shown, observation))
         estimate = _clip(estimate, self._state_bounds)
         near = _clip(estimate, self._error_bounds)  # the motors have little to spare for a far goal
-        gains = xp.asarray(self._change, dtype=observation.dtype)
-        change = -matmul(xp.concat([near, state.command], axis=-1), gains.T)
-        command = _clip(state.command + change, self._limits)
+        change = times(self._change, xp.concat([near, state.command], axis=-1))
+        command = _clip(state.command - change, self._limits)
         integral, copied = self._pid.step(state.integral, observation)
         vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
         vertical = _clip(vertical, self._limits[1])
         sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
         return State(self._filter.moved(estimate, command), command, integral), sent
-
-    def _measured(self, observation: Array) -> Array:
-        """What the filter measures, (..., m)."""
-        signs = observation.__array_namespace__().asarray(self._signs, dtype=observation.dtype)
-        return signs * observation[..., self._shown]
 
     def _bounds(self, names: tuple[str, ...], limits: Any) -> np.ndarray:
         """(n,) the `limits` of the states `names` that the model has, infinite for the others."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_continuous_are
 
-from mjxball.arrays import Array, matmul
+from mjxball.arrays import Array
 
 
 class Filter(NamedTuple):
@@ -24,17 +24,21 @@ class Filter(NamedTuple):
 
     def start(self, y: Array) -> Array:
         """State (..., n) at the first measurement `y` (..., k): 0 where nothing is measured."""
-        return matmul(y, y.__array_namespace__().asarray(self.measured, dtype=y.dtype))
+        return times(self.measured.T, y)
 
     def corrected(self, x: Array, y: Array) -> Array:
         """The expected state `x` (..., n) after the measurement `y` (..., k)."""
-        measured, gain = (x.__array_namespace__().asarray(part, dtype=x.dtype) for part in (self.measured, self.gain))
-        return x + matmul(y - matmul(x, measured.T), gain.T)
+        return x + times(self.gain, y - times(self.measured, x))
 
     def moved(self, x: Array, u: Array) -> Array:
         """The state a period after `x` (..., n), in which `u` (..., m) acts."""
-        a, b = (x.__array_namespace__().asarray(part, dtype=x.dtype) for part in (self.transition, self.drive))
-        return matmul(x, a.T) + matmul(u, b.T)
+        return times(self.transition, x) + times(self.drive, u)
+
+
+def times(matrix: Array, vector: Array) -> Array:
+    """(..., k) of (..., k, n) and (..., n) in the type of `vector`, the same for one as for many."""
+    matrix = vector.__array_namespace__().asarray(matrix, dtype=vector.dtype)
+    return (matrix * vector[..., None, :]).sum(axis=-1)
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

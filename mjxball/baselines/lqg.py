@@ -12,7 +12,8 @@ import numpy as np
 
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import ideal_model, pair_model
-from mjxball.baselines.motion import PAIR_INERTIA, Tuning, asked, disturbance_filter, noise, position_gains
+from mjxball.baselines.linear import times
+from mjxball.baselines.motion import PAIR_INERTIA, Tuning, disturbance_filter, noise, position_gains
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import copy_command
@@ -47,7 +48,7 @@ class Takeover:
 
     def _desired(self, observation: Array) -> Array:
         """What the assembly should do: roll, pitch, vertical acceleration (..., 3)."""
-        xp, (far, back) = observation.__array_namespace__(), asked(self._gains, observation)
+        xp, (far, back) = observation.__array_namespace__(), (times(gains, observation) for gains in self._gains)
         limit = xp.asarray(self._far, dtype=far.dtype)
         return xp.clip(far, -limit, limit) + back
 
@@ -161,11 +162,11 @@ class Lqg(Takeover):
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
-        return self._filter.start(self._model.seen(observation)[..., self._shown])
+        return self._filter.start(times(self._shown, self._model.seen(observation)))
 
     def estimate(self, state: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(the filter's state (..., n), torque of the load (..., A) [N m], error of the lift (...) [m/s2])."""
-        x, turns = self._filter.corrected(state, observation[..., self._shown]), 5 * len(self._model.axes)
+        x, turns = self._filter.corrected(state, times(self._shown, observation)), 5 * len(self._model.axes)
         return x, x[..., 3:turns:5], x[..., -1] if self.tuning.lift_walk > 0.0 else 0.0
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import AssemblyModel
 from mjxball.baselines.linear import Filter, continuous_regulator, discretise, kalman
+from mjxball.control.observation import OBSERVATION_SIZE
 
 # Places in the state. Along x: error [m], its rate [m/s], pitch [rad], its rate [rad/s], torque of the rotors [N m], of
 # the load [N m], and its rate [N m/s]; along y the same about roll.
@@ -29,9 +29,8 @@ AXES = (  # of roll and pitch, in the order of the first seven
     (EX, VX, PITCH, PITCH_RATE, TORQUE, LOAD, LOAD_RATE),
 )
 HEIGHT = VZ, LIFT, LIFT_ERROR
-SHOWN = {PITCH: 4, PITCH_RATE: 10, ROLL: 3, ROLL_RATE: 9, VZ: 17}  # place in an observation
-# Of position and velocity, places in an observation: what roll, pitch and lift are for.
-ERRORS, ERROR_RATES = np.array([13, 12, 14]), np.array([16, 15, 17])
+# Place in an observation.
+SHOWN = {EX: 12, VX: 15, PITCH: 4, PITCH_RATE: 10, EY: 13, VY: 16, ROLL: 3, ROLL_RATE: 9, EZ: 14, VZ: 17}
 TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
 PAIR_INERTIA = 0.0644  # of the pair about pitch, for which torque walks are [kg m2]
 
@@ -95,7 +94,7 @@ def disturbance_filter(
     deviations: Mapping[int, float],
     scale: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Filter, np.ndarray]:
-    """(the filter of tilts with what turns them and, if its error walks, of the lift; places of y in an observation).
+    """(the filter of tilts with what turns them and, if its error walks, of the lift; (k, 18) its y of an observation).
 
     Its state: for each of `axes` angle, rate, torque of the rotors, of the load, its rate; then climb downwards, lift,
     error of the lift. Its u as of `motion`; `deviations` as of `noise`, `scale` as of `Tuning.walks`.
@@ -107,28 +106,28 @@ def disturbance_filter(
     )
     a, b = motion(model, tuning)
     sampled = discretise(a[np.ix_(states, states)], b[states], model.period)
-    return kalman(*sampled, model.period, walks, measured), np.array([SHOWN[states[place]] for place in measured])
+    return kalman(*sampled, model.period, walks, measured), np.eye(OBSERVATION_SIZE)[
+        [SHOWN[states[place]] for place in measured]
+    ]
 
 
 def position_gains(model: AssemblyModel, tuning: Tuning) -> np.ndarray:
-    """(3, 4) feedback on error, its rate, angle and rate, of roll, pitch and height: LQRs about closed loops."""
+    """(2, 3, 18) roll, pitch and vertical acceleration for an observation: for errors and their rates, against tilts.
+
+    By LQRs of both tilts about their closed loops, and of the height.
+    """
     tilt_cost = np.diag([tuning.position**-2, tuning.velocity**-2, 0.0, 0.0])
     height_cost = np.diag([tuning.height**-2, tuning.climb**-2])
-    found = np.zeros((3, 4))
+    found = np.zeros((2, 3, OBSERVATION_SIZE))
     for axis, frequency in enumerate(model.natural_frequency):
         a = np.zeros((4, 4))
         a[0, 1] = a[2, 3] = 1.0
         a[1, 2] = (-1.0, 1.0)[axis] * model.gravity
         a[3, 2], a[3, 3] = -(frequency**2), -2.0 * model.damping * frequency
         b = np.array([[0.0], [0.0], [0.0], [frequency**2]])
-        found[axis] = continuous_regulator(a, b, tilt_cost, np.array([[TILT**-2]]))[0]
+        gains = continuous_regulator(a, b, tilt_cost, np.array([[TILT**-2]]))[0]
+        places = [SHOWN[state] for state in AXES[axis][:4]]
+        found[0, axis, places[:2]], found[1, axis, places[2:]] = gains[:2], -gains[2:]
     a, b = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    found[2, :2] = continuous_regulator(a, b, height_cost, np.array([[VERTICAL**-2]]))[0]
+    found[0, 2, [SHOWN[EZ], SHOWN[VZ]]] = continuous_regulator(a, b, height_cost, np.array([[VERTICAL**-2]]))[0]
     return found
-
-
-def asked(gains: Array, observation: Array) -> tuple[Array, Array]:
-    """What the assembly should do by `position_gains`, (..., 3) each: for position and velocity, and against tilts."""
-    error, rate, angle, turn = observation.__array_namespace__().asarray(gains.T, dtype=observation.dtype)
-    far = error * observation[..., ERRORS] + rate * observation[..., ERROR_RATES]
-    return far, -(angle * observation[..., 3:6] + turn * observation[..., 9:12])

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.arrays import Array
+from mjxball.baselines.linear import times
 from mjxball.baselines.motion import LIFT, PITCH, PITCH_RATE, ROLL, ROLL_RATE
 from mjxball.baselines.mpc_design import MEASURED, NAME, PAIR, TEAM, Design, Limits, design, limits_of
 from mjxball.config import Config
@@ -194,7 +195,7 @@ class Mpc:
     def _estimate(self, own: Design, state: Array, observation: Array) -> Array:
         """The filter's state (..., n) at `observation`, as old as its measurements are taken to be."""
         left = joined(self._measured(observation)) - joined([state[..., place] for place in MEASURED])
-        return state[..., : self._states] + _times(own.gain, left)
+        return state[..., : self._states] + times(own.gain, left)
 
     def _seen(self, observation: Array) -> Array:
         """`observation` (..., 18), of a team in mount frames, in body axes."""
@@ -218,11 +219,11 @@ class Mpc:
 
     def _moved(self, own: Design, x: Array, command: Array, hover: Array) -> Array:
         """State (..., n) a period after `x` with the follower's `command` (..., 3), of rotors that have limits."""
-        led, lost = _times(own.led, x), 0.0
+        led, lost = times(own.led, x), 0.0
         for drones, sent in ((1.0, led), (self._others, command)):
             room, asked = self._room(sent[..., 2], hover)[..., None], self._asked(sent, x)
             lost = lost + drones * (clipped(asked, -room, room) - asked)
-        return _times(own.transition, x) + _times(own.drive, command) + _times(own.torque_drive, lost)
+        return times(own.transition, x) + times(own.drive, command) + times(own.torque_drive, lost)
 
     def _asked(self, sent: Array, x: Array) -> Array:
         """(..., 2) roll and pitch torque that the attitude loop of a drone asks for at `sent` (..., 3) [N m]."""
@@ -238,10 +239,10 @@ class Mpc:
     def _command(self, own: Design, x: Array, hover: Array, kind: Array) -> Array:
         """The command (..., 3) at state `x` (..., n), its vertical part clipped first: it takes what rotors have."""
         xp, (tilt_limit, vertical_limit) = x.__array_namespace__(), self._leader[-2:]
-        wanted, far = _times(own.feedback, x), _times(own.far, x)
+        wanted, far = times(own.feedback, x), times(own.far, x)
         correction, known = self._corrections(x, hover, kind)
         limited = clipped(far, -own.far_limit, own.far_limit) - far
-        wanted = wanted + _times(own.correction, xp.where(known[..., None], correction, limited))
+        wanted = wanted + times(own.correction, xp.where(known[..., None], correction, limited))
         vertical = clipped(wanted[..., 2], -vertical_limit, vertical_limit)
         room, parts = self._room(vertical, hover), []
         for axis, angle, rate in AXES:
@@ -267,11 +268,6 @@ class Mpc:
             found = self._programs[one].corrections(states[chosen], hover[chosen].astype(float))
             first[chosen], known[chosen] = found
         return first.reshape(*batch, 3).astype(x.dtype), known.reshape(batch)
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    """(..., k) of (..., k, n) and (..., n), the same for one as for many."""
-    return (matrix * vector[..., None, :]).sum(axis=-1)
 
 
 def _from_jax(solve: Callable[..., Any]) -> Callable[..., Any]:

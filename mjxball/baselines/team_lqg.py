@@ -12,8 +12,9 @@ import numpy as np
 
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
+from mjxball.baselines.linear import times
 from mjxball.baselines.lqg import CORRECTION_LIMIT, OffsetFree
-from mjxball.baselines.motion import asked, disturbance_filter, noise, position_gains
+from mjxball.baselines.motion import disturbance_filter, noise, position_gains
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
@@ -80,11 +81,11 @@ class TeamOffsetFree:
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
-        return self.filter.start(observation[..., self._shown])
+        return self.filter.start(times(self._shown, observation))
 
     def estimate(self, state: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(the filter's state (..., 13), load about roll and pitch (..., 2) [rad/s2], error of the lift (...))."""
-        x = self.filter.corrected(state, observation[..., self._shown])
+        x = self.filter.corrected(state, times(self._shown, observation))
         return x, x[..., 3:10:5], x[..., -1]
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
@@ -102,7 +103,7 @@ class TeamOffsetFree:
         """The command (..., 3) for these estimates, only its vertical part clipped; the leader's is `led`."""
         xp, ratio, limit = observation.__array_namespace__(), self.team.ratio, self._leader[-1]
         lever, room = (xp.asarray(part, dtype=led.dtype) for part in (self.team.lever, self.team.room))
-        far, back = asked(self.gains, observation)
+        far, back = (times(gains, observation) for gains in self.gains)
         rise = xp.clip(far[..., 2], -TUNING.lift_limit, TUNING.lift_limit)
         vertical = xp.clip(ratio * (rise - lift) - (ratio - 1.0) * led[..., 2], -limit, limit)
         held = load / self.stiffness + lever * (vertical - led[..., 2])[..., None]
