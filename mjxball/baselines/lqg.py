@@ -21,11 +21,11 @@ from mjxball.plant import plant_parameters
 
 CORRECTION_LIMIT = 0.6  # of all followers' roll and pitch against the load's torque [rad]
 LIMITS = (1.0, 0.6)  # of a command, about an axis that the load turns and about another [rad]
-# The first reproduces an independent simulation; with delayed commands it limit-cycles. SLOW settles earliest under
-# noise and 40 ms of delay among the sets that settle in every case (docs/archive/training.md).
+# QUICK reproduces an independent simulation; with delayed commands it limit-cycles. SLOW settles earliest under noise
+# and 40 ms of delay among the sets that settle in every case (docs/archive/training.md).
 QUICK = Tuning(position=0.25, velocity=1.0, height=0.25, climb=1.0, torque_walk=9.0, tilt_limit=0.25)
-OFFSET_FREE = Tuning(position=0.2, velocity=0.6, height=0.2, climb=0.6, torque_walk=0.003, lift_walk=0.01)
 SLOW = Tuning(position=0.15, velocity=0.6, height=0.15, climb=0.6, torque_walk=0.003)
+OFFSET_FREE = Tuning(position=0.2, velocity=0.6, height=0.2, climb=0.6, torque_walk=0.003, lift_walk=0.01)
 
 
 class Takeover:
