@@ -105,7 +105,7 @@ def test_baselines_do_not_round_their_products() -> None:
                 continue  # of another plant, or NumPy's alone
             assert default == 0, (preset, name)
             multiplied += count
-        assert multiplied > 2, preset
+        assert multiplied > 5, preset
 
 
 @pytest.mark.slow  # JaxMARL takes 4 s to import, Brax two

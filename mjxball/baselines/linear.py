@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_continuous_are
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, matmul
 
 
 class Filter(NamedTuple):
@@ -38,7 +38,7 @@ class Filter(NamedTuple):
 def times(matrix: Array, vector: Array) -> Array:
     """(..., k) of (..., k, n) and (..., n) in the type of `vector`, the same for one as for many."""
     matrix = vector.__array_namespace__().asarray(matrix, dtype=vector.dtype)
-    return (matrix * vector[..., None, :]).sum(axis=-1)
+    return matmul(matrix, vector[..., None])[..., 0]
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
