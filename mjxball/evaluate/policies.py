@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball import config as configs
-from mjxball.config import Config, with_current_names
+from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
@@ -85,10 +85,7 @@ def trained_rigs(policy: Policy) -> Config:
 
 def team_sizes(policy: Policy) -> tuple[int, ...]:
     """Numbers of drones of the teams that `policy` was trained in; () if it was made for one plant."""
-    trained = with_current_names(policy.card.get("config"))
-    scenario = trained.get("scenario") if isinstance(trained, dict) else None
-    sizes = scenario.get("team_sizes") if isinstance(scenario, dict) else None
-    return tuple(sizes) if isinstance(sizes, list) and all(isinstance(size, int) for size in sizes) else ()
+    return configs.from_record({"plant": {}, **policy.card.get("config", {})}).scenario.team_sizes
 
 
 def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> None:
@@ -102,14 +99,12 @@ def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> N
 
 def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None:
     """Refuse a policy whose leader or attitude loop was another than the one that it would fly with."""
-    trained = with_current_names(card.get("config"))
-    if not isinstance(trained, dict):
+    if "config" not in card:
         return
+    trained = configs.from_record({"plant": {}, **card["config"]})
     for section in ("leader", "attitude"):
-        for key, value in dataclasses.asdict(getattr(config, section)).items():
-            made_for = (trained.get(section) or {}).get(key, value)
-            made_for = tuple(made_for) if isinstance(made_for, list) else made_for
-            if made_for != value:
+        for key, made_for in dataclasses.asdict(getattr(trained, section)).items():
+            if made_for != (value := getattr(getattr(config, section), key)):
                 raise InputError(f"{path} was trained with {section}.{key} {made_for!r}, not {value!r}")
 
 
