@@ -21,13 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
+from batch import Batch
 from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, ball_limit, preset
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics.motion import ROLLING_FRICTION
