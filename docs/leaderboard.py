@@ -37,8 +37,8 @@ meets all of its own. Every load leaves a [margin](model.md#what-can-be-trimmed)
 | any rig | rigs that no training draws, masses and thrusts not as believed | noise, 20 ms |
 | two Crazyflies | simulated 2.1 with a ball, masses and thrusts off | noise / 2, drift, 30 ms, the radio's resolution |
 
-`balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained). `transport` (of the preset
-`transport-large`, 2 million steps) and `robust` are in `policies/archive/`.
+`balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained). `transport` (2
+million steps of SAC) and `robust` are in `policies/archive/`.
 `transport-sac`, `-ppo` and `-gradient` are what `python train.py transport --physics newton-euler --algorithm sac`,
 `ppo` or `gradient` comes to within a minute and a half on two cores. `brax-*`, `sb3-*` and `sbx-sac` are Brax's,
 Stable-Baselines3's and SBX's own SAC and PPO, of seed 0, in the same environment for as many steps: `python
