@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -96,29 +94,6 @@ def test_a_size_is_known_without_computing_a_reset(looks: bool, size: int, compu
     once = TracedOnce(env)
     assert [once.observation_size, once.observation_size] == [size, size]
     assert env.computed == computed
-
-
-def test_a_state_is_known_without_the_physics_engine_or_brax_physics() -> None:
-    """In a process of its own; Brax is whole for whoever asks for more of it."""
-    code = """
-import sys
-from mjxball.config import preset
-from mjxball.train.population import Population
-population = Population(preset("transport"), "mjx")
-assert population.template().envs.obs.shape == (512, 18), population.template().envs.obs.shape
-assert "mujoco" not in sys.modules
-import jax
-state = population.template().envs
-one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), state)
-jax.eval_shape(population.program.env.step, one, jax.ShapeDtypeStruct((3,), "float32"))
-assert "mujoco.mjx" in sys.modules
-import brax
-from brax import envs
-assert brax.System.__module__ == "brax.base" and envs.Env.__module__ == "brax.envs.base"
-"""
-    command = [sys.executable, "-W", "ignore", "-c", code]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_longest_program_is_loaded_ahead_if_it_was_traced_before(
