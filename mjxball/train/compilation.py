@@ -97,11 +97,6 @@ class TracedProgram:
         self._path = _path(name, key)
         self._kept = _read(self._path)
 
-    @property
-    def found(self) -> bool:
-        """Whether it need not be traced."""
-        return self._kept is not None
-
     def _traced(self) -> tuple[Any, list[int]]:
         """The exported program and which of the carried arrays it leaves unchanged."""
         if self._kept is None:
