@@ -21,7 +21,7 @@ from gymnasium.utils.seeding import np_random
 
 import mjxball.gym
 from mjxball.baselines import make_baseline
-from mjxball.config import PRESETS, Config, preset
+from mjxball.config import PRESETS, Config, preset, replace
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.results import fly_scenarios
@@ -83,7 +83,7 @@ def test_it_flies_as_the_brax_environment(name: str, request: pytest.FixtureRequ
     C MuJoCo (`balance`: the closed form) against closed-form physics, which compiles fastest; tests/test_env.py holds
     MJX against it.
     """
-    config = preset(name)
+    config = replace(preset(name), "follower.recurrent_units", 0)  # as Gymnasium has it
     env = FollowerEnv(config=config)
     first, _ = env.reset(seed=7)
     _, key = jax.random.split(jax.random.key(common.seed_number(np_random(7)[0])))
