@@ -272,7 +272,7 @@ class Program:
         extensions: Extensions = DEFAULTS,
     ):
         for path, value in (overrides or {}).items():
-            config = configs.replace(config, configs.current_name(path), value)
+            config = configs.replace(config, path, value)
         self.config, self._shards = config, shards or Shards()
         with jax.default_matmul_precision(MATMUL_PRECISION):  # what is traced for checks need not be traced again
             self.env = make_env(extensions, config, physics)
