@@ -151,7 +151,7 @@ class Environments(Protocol):
         ...
 
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
-        """The same environments, which `transform` of the step of a single one steps instead of its `jax.vmap`."""
+        """The same environments, which `transform` of the step of a single one steps, such as `jax.vmap`."""
         ...
 
     def drawn(self, envs: Any, key: Array) -> Any:

@@ -13,11 +13,11 @@ import optax
 
 from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
 from mjxball.algorithms.recurrent import fresh_layers
-from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
+from mjxball.scalar_form import scalar_form
 
 SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
@@ -74,7 +74,8 @@ class FirstOrderGradient:
         own = config.gradient
         # Number by number a window's gradient takes a quarter of the time, and two thirds to compile; but it has none
         # forwards.
-        self._config, self._environments, self._plain = own, environments.rewritten(scalar_form), environments
+        self._environments, self._plain = (environments.rewritten(form) for form in (scalar_form, jax.vmap))
+        self._config = own
         self._shards = environments.shards
         self._adam = optax.scale_by_adam(*own.adam_betas)
         self.steps_per_collect = own.horizon

@@ -55,22 +55,17 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
         linear, angular = accelerations(balance)
         # m_b e . (a_b + w' x r + w x (w x r) + 2 w x r' + g u + r'') + 2/5 m_b x'' = F for the direction e of each
         # coordinate x of the ball at r; a_b and w' are linear in x''.
-        known = (
-            linear + cross(angular, r) + cross(w, cross(w, r)) + 2.0 * cross(w, speed) + numbers.gravity * balance.down
-        )
+        carried = cross(w, cross(w, r)) + 2.0 * cross(w, speed) + numbers.gravity * balance.down
+        known = linear + cross(angular, r) + carried
         forces = coordinates(ball_force, len(axes))
         driving = [force / ball_mass - known[..., axis] for axis, force in zip(axes, forces, strict=True)]
         pushes = [_along((axis,), -ball_mass) for axis in axes]
         recoils = [accelerations(balance._replace(force=push, torque=cross(r, push))) for push in pushes]
         columns = [a + cross(turning, r) for a, turning in recoils]
-        inertia = [
-            [
-                (axis == other) * (1 + ROLLING_INERTIA) + column[..., axis]
-                for other, column in zip(axes, columns, strict=True)
-            ]
-            for axis in axes
-        ]
-        ball = solve_small(inertia, driving)
+        rows = [[column[..., axis] for column in columns] for axis in axes]
+        for number, row in enumerate(rows):
+            row[number] = row[number] + (1 + ROLLING_INERTIA)
+        ball = solve_small(rows, driving)
         for one, (a, turning) in zip(ball, recoils, strict=True):
             linear, angular = linear + one[..., None] * a, angular + one[..., None] * turning
         return rotate(matrix, linear), angular, joined(ball)
@@ -104,9 +99,8 @@ def _balance(
     u = matrix[..., 2, :]
     mass = (rigid_mass(numbers) + object_mass)[..., None]
     moment = rigid_moment(numbers) + m * c
-    inertia = (
-        rigid_inertia(numbers) + diagonal(m * numbers.object_inertia_per_mass) + m[..., None] / share * point_inertia(c)
-    )
+    own = diagonal(m * numbers.object_inertia_per_mass)
+    inertia = rigid_inertia(numbers) + own + m[..., None] / share * point_inertia(c)
     if added is not None:
         inertia = inertia + diagonal(added)
     slip = 2.0 * cross(w, rate) + acceleration
