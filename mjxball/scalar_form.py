@@ -15,7 +15,7 @@ from jax.extend import core
 
 Value = Any  # an array, or `Parts`
 Parts = Any  # object array with a tracer or a NumPy scalar for each number
-LARGEST = 128  # numbers; operations on larger arrays stay as they are
+LARGEST = 12  # numbers; operations on larger arrays stay as they are: apart they compile longer and run no sooner
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 ELEMENTWISE = frozenset(
     (

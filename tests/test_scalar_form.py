@@ -20,7 +20,7 @@ def rotation(x: Any) -> Any:
     turned = jnp.stack([rest, rest[::-1]]).T @ jnp.diag(jnp.array([1.0, 0.0]))
     many = jnp.broadcast_to(jnp.sin(first), (3,)) + turned.sum(axis=1)
     swept = jax.lax.fori_loop(0, 4, lambda i, y: jnp.where(y > 0, y * 0.9, jnp.clip(y, -1.0, 1.0)) + many, many)
-    cube = (first * jnp.arange(24.0)).reshape(2, 3, 4).transpose(2, 0, 1)
+    cube = (first * jnp.arange(12.0)).reshape(2, 3, 2).transpose(2, 0, 1)
     square = jnp.concatenate([swept, first]).reshape(2, 2)
     return {"a": square, "b": jnp.max(x), "c": jnp.linalg.norm(swept) / 2.0, "d": cube}
 
