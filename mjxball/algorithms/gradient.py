@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
 from mjxball.algorithms.recurrent import fresh_layers
 from mjxball.arrays import Array
 from mjxball.config import Config
@@ -42,7 +42,7 @@ def _of_all_members(count: int, batched: Any, value: Array) -> tuple[Array, bool
 class GradientState(NamedTuple):
     """What the algorithm knows."""
 
-    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`RecurrentNetwork`)
+    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`PolicyNetwork`)
     adam: Any
     slope: Any  # gradient of the last window's loss, a pytree like `layers`
     loss: Array  # () minus the mean reward of the last window
@@ -251,8 +251,7 @@ class FirstOrderGradient:
         xp = state.mean.__array_namespace__()  # NumPy's, when a policy file is written: nothing is compiled for that
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
-        network = RecurrentNetwork if self._units else PolicyNetwork
-        return network(state.layers, state.mean, deviation, self._mask)
+        return PolicyNetwork(state.layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
         """Everything that is known is whole."""
