@@ -35,4 +35,4 @@ def rotor_commands(
     torque = kp * (desired - euler) - kd * rates
     wrench = mixer.turned(xp.concat([thrust[..., None], torque], axis=-1), -yaw)
     rotors = mixer.rotors_from_wrench(wrench, arm, yaw_per_thrust, layout)
-    return clipped(rotors, 0.0, xp.asarray(rotor_force_max)[..., None])
+    return clipped(rotors, 0.0, xp.asarray(rotor_force_max, dtype=rotors.dtype)[..., None])
