@@ -121,7 +121,7 @@ class Environments:
         self.policy_mask = getattr(env, "input_mask", None) or [1.0] * self.observation_size
         self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
         self.smooth = is_pair(env)
-        # Number by number a CPU takes half of the time for a step in closed form; MJX gains nothing, and compiles longer.
+        # Number by number a CPU takes half of the time for a closed-form step; MJX gains nothing, and compiles longer.
         closed = self.smooth and env.backend == "newton-euler" and jax.default_backend() == "cpu"
         self._step = (scalar_form if closed else jax.vmap)(env.step)
         sizes = getattr(env, "team_sizes", None)
