@@ -174,6 +174,7 @@ SOURCES = (
     "assembly.py",
     "env.py",
     "rewards.py",
+    "scalar_form.py",
     "control",
     "plant",
     "physics",
