@@ -105,7 +105,7 @@ def test_an_estimate_that_fails_later_still_leads_down() -> None:
         (0.4, 1.94, "pose-jump", 0.33, "pose-lost"),
     ):
         world = hovering(height=height, flown=flown)
-        world.drones[0].inject(FAULT_KINDS[first])
+        world.drones[0].inject(FAULT_KINDS[first].what)
         world.fly_for(later)
         track = after(world, second, 1)
         assert world.touchdown_speed() < 0.6, first

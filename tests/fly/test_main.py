@@ -96,7 +96,7 @@ def test_an_install_that_cannot_write_mcap_is_refused(monkeypatch: pytest.Monkey
                 changed.delitem(sys.modules, name)
             changed.setitem(sys.modules, missing, None)
             assert call(main, [TRANSPORT, *URIS, "--log", "flight.mcap"]) == 2
-            assert "pip install 'mjxball[logs]'" in capsys.readouterr().err
+            assert "pip install 'mjxball[fly]'" in capsys.readouterr().err
 
 
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
