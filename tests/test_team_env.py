@@ -68,6 +68,7 @@ class TestRings:
             elif name != "ball_stop":
                 assert found == pytest.approx(value, rel=1e-4, abs=1e-6), name
 
+    @pytest.mark.slow
     def test_a_padded_rig_moves_as_the_rig_itself(self) -> None:
         """The same commands to three drones, alone and with three that pad: the same accelerations."""
         config = settings(scenario__team_sizes=SIZES, scenario__cg_amplitude=(0.1, 0.1), scenario__start_tilt=0.3)
@@ -242,6 +243,7 @@ class TestAgents:
         with pytest.raises(InputError, match="multiple of 11"):
             Agents(SIZES, 5, 32)
 
+    @pytest.mark.slow
     def test_actions_reach_their_followers_and_worlds_end_as_a_whole(self) -> None:
         config = settings(timing__episode_steps=3)
         env = TransportEnv(config, "newton-euler")

@@ -125,7 +125,6 @@ def assert_leaves_no_trace(place: Path, compiler: Sequence[str] = ("gcc", "-O1")
     return calm
 
 
-@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize(
     "name",
@@ -139,7 +138,6 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tm
     assert_leaves_no_trace(tmp_path)
 
 
-@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("int8", [False, True])
 def test_compilers_that_are_told_of_finite_numbers_only_remove_no_guard(int8: bool, tmp_path: Path):

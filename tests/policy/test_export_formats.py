@@ -316,6 +316,7 @@ def test_a_policy_that_was_told_its_team_flies_as_one_that_joined(tmp_path: Path
     assert told.card["team"]["mount_angle"] == pytest.approx(np.arctan2(-mount[1], -mount[0]))
 
 
+@pytest.mark.slow
 def test_a_missing_package_is_named_with_its_extra(saved: Path):
     script = "import sys; sys.modules['onnx'] = None; from mjxball.export import main; sys.exit(main(sys.argv[1:]))"
     done = run(["-c", script, saved, "out.onnx"], Path(__file__).parents[2])

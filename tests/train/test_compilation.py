@@ -98,6 +98,7 @@ def test_a_size_is_known_without_computing_a_reset(looks: bool, size: int, compu
     assert env.computed == computed
 
 
+@pytest.mark.slow
 def test_a_state_is_known_without_the_physics_engine_or_brax_physics() -> None:
     """In a process of its own; Brax is whole for whoever asks for more of it."""
     code = """

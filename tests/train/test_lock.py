@@ -53,6 +53,7 @@ def written(place: Path, renewed: float, **holder: object) -> None:
     os.utime(place / lock.LOCK, (then, then))
 
 
+@pytest.mark.slow
 def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
     run = tmp_path / "run"
     found = json.loads((run / lock.LOCK).read_text())
@@ -72,6 +73,7 @@ def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder
     assert f"process {holder.pid}" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_lock_ends_with_its_process_however_that_ends(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
     run = tmp_path / "run"
     holder.send_signal(signal.SIGKILL)

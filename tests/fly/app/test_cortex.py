@@ -36,7 +36,6 @@ FIRMWARE = (  # its Kbuild's, release 2026.08: gcc's dialect has functions of it
 )
 
 
-@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("name", ["flight", "flight --int8", "stand", "universal", "recurrent flight --int8"])
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
