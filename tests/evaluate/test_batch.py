@@ -32,7 +32,8 @@ SCENARIOS = [
     "name",
     [
         "copy",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("balance", "adaptive-mass", "lqg", "oracle")),
+        pytest.param("balance", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.release) for name in ("adaptive-mass", "lqg", "oracle")),
     ],
 )
 def test_batch_equals_recorded_flights(name: str) -> None:

@@ -85,8 +85,13 @@ def horizon() -> ModuleType:
     return module
 
 
+POLICIES = [
+    pytest.param(path, marks=[pytest.mark.release] if path.stem != "flight" else []) for path in shipped_policies()
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", shipped_policies(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
 def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
     """Its load at rest, and moving slowly and quickly: nothing is lost, and what its card is good for stays steady."""
     flown = Policy.load(path).card["flown"]

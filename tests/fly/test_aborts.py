@@ -109,9 +109,11 @@ SECONDS = 8.0
 SAFE_WITHIN = 9.0  # [s] battery_time 5, then LAND; all others are far below
 
 
-# Every fault at one drone in the first tier, alternately, and at the other in the second.
+# Every fault at one drone, alternately, and at the other weekly.
 AT = [
-    pytest.param(fault, number, marks=() if index % 2 == number else pytest.mark.slow, id=f"{fault.__name__}-{number}")
+    pytest.param(
+        fault, number, marks=() if index % 2 == number else pytest.mark.release, id=f"{fault.__name__}-{number}"
+    )
     for index, fault in enumerate(FAULTS)
     for number in (0, 1)
 ]

@@ -217,7 +217,7 @@ def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("real", ["float", "double"])
+@pytest.mark.parametrize("real", ["float", pytest.param("double", marks=pytest.mark.release)])
 def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_path: Path):
     dtype = np.float32 if real == "float" else np.float64
     flight = flown(contents, dtype)
