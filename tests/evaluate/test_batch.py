@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tables import weekly
 
 from mjxball.baselines import LAWS, make_baseline
 from mjxball.config import preset
@@ -33,7 +34,7 @@ SCENARIOS = [
     [
         "copy",
         pytest.param("balance", marks=pytest.mark.slow),
-        *(pytest.param(name, marks=pytest.mark.release) for name in ("adaptive-mass", "lqg", "oracle")),
+        *weekly("adaptive-mass", "lqg", "oracle"),
     ],
 )
 def test_batch_equals_recorded_flights(name: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from fly_virtual import VirtualTwin, thrusts
+from tables import weekly
 
 from mjxball.policy import Policy, shipped_policy
 from mjxfly.limits import FlightSettings, Times
@@ -109,13 +110,13 @@ SECONDS = 8.0
 SAFE_WITHIN = 9.0  # [s] battery_time 5, then LAND; all others are far below
 
 
+FIRST = (lost, jump, crash, interrupt, kill)  # one of each way to end
 # Every fault at one drone, alternately, and at the other weekly.
 AT = [
-    pytest.param(
-        fault, number, marks=() if index % 2 == number else pytest.mark.release, id=f"{fault.__name__}-{number}"
-    )
+    pytest.param(fault, number, marks=marks, id=f"{fault.__name__}-{number}")
     for index, fault in enumerate(FAULTS)
     for number in (0, 1)
+    for marks in [pytest.mark.release if index % 2 != number else () if fault in FIRST else pytest.mark.slow]
 ]
 
 
@@ -140,7 +141,7 @@ def test_any_fault_brings_both_down(fault: Callable[[VirtualTwin, int], None], n
 
 
 @pytest.mark.parametrize("fault", [silence, lost, silence_up], ids=lambda fault: fault.__name__)
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, *weekly(1)])
 def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
     fault: Callable[[VirtualTwin, int], None], number: int
 ) -> None:

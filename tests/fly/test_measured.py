@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from captured import CapturedTwin
-from tables import rows
+from tables import rows, weekly
 
 from mjxball.control import rotations
 from mjxball.physics.step import start_state
@@ -226,10 +226,6 @@ def ended(world: VirtualTwin, limit: float) -> tuple[float, float, str, str]:
     return math.inf, float(np.linalg.norm(world.moment().position - start)), "", ""
 
 
-def weekly(*cases: object) -> list:
-    return [pytest.param(case, marks=pytest.mark.release) for case in cases]
-
-
 # What happens to the poses of which drones, within [s], with at most this way of O [m], and what is said.
 POSES: list[tuple[str, float, tuple[int, ...], float, float, str]] = [
     ("frozen", 1.0, (0,), 0.6, 0.02, "leader: x of its measured pose stands still"),
@@ -304,7 +300,7 @@ CONDITIONS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["both", *weekly(*set(CONDITIONS) - {"both"})])
+@pytest.mark.parametrize("name", ["both", *weekly(*(name for name in CONDITIONS if name != "both"))])
 def test_nothing_is_said_in_good_flights(name: str) -> None:
     world = VirtualTwin(FLIGHT, FlightSettings(seconds=4.0), surroundings=CONDITIONS[name], settle=0.6)
     assert world.run(30.0) == "done"

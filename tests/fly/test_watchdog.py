@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, environment
 from conftest import too_busy
-from tables import rows
+from tables import rows, weekly
 
 from mjxball.policy import load_file
 from mjxfly import flight_log, packets, watchdog
@@ -237,7 +237,7 @@ TAKEN_OVER = 0.4  # [s] after the last setpoint
 @pytest.mark.alone
 @pytest.mark.parametrize(
     "phase",
-    ["fly", "hold", *(pytest.param(one, marks=pytest.mark.release) for one in ("ramp", "land", "descend", "stop"))],
+    ["fly", "hold", *weekly("ramp", "land", "descend", "stop")],
 )
 def test_a_main_thread_that_stands_still_at_a_change_of_phase_is_found(phase: str, tmp_path: Path) -> None:
     """Its other threads go on: states come, the display writes, pings go out."""

@@ -15,6 +15,7 @@ import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
 from onboard_bench import needs_gcc
+from tables import weekly
 
 from mjxball import __version__
 from mjxball.cli import plant_setup
@@ -217,7 +218,7 @@ def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("real", ["float", pytest.param("double", marks=pytest.mark.release)])
+@pytest.mark.parametrize("real", ["float", *weekly("double")])
 def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_path: Path):
     dtype = np.float32 if real == "float" else np.float64
     flight = flown(contents, dtype)

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 from command_line import HASTY, REPOSITORY
+from tables import weekly
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.train.extensions import find
@@ -51,7 +52,7 @@ for algorithm in ALGORITHMS:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["newton-euler", pytest.param("mjx", marks=pytest.mark.release)])
+@pytest.mark.parametrize("engine", ["newton-euler", *weekly("mjx")])
 def test_every_algorithm_trains_two_members_on_two_devices(engine: str) -> None:
     """PPO ended the process in XLA's partitioner, exit code 134."""
     flags = f"{HASTY} --xla_force_host_platform_device_count=2"
