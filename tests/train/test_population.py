@@ -177,7 +177,7 @@ def test_population_run_exports_every_member_and_the_best(
     assert train(["--resume", str(out)]) == 0
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_members_are_spread_over_devices(together: tuple[Population, Any, Any], tmp_path: Path) -> None:
     """Two CPU devices in a process of their own: the same members as on one, up to rounding."""
     code = f"""

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 from command_line import HASTY, REPOSITORY
-from tables import weekly
 
 from mjxball.algorithms import ALGORITHMS
+from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.train.extensions import find
 
 TINY = {
@@ -51,8 +51,8 @@ for algorithm in ALGORITHMS:
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["newton-euler", *weekly("mjx")])
+@pytest.mark.release
+@pytest.mark.parametrize("engine", TRAINING_ENGINES)
 def test_every_algorithm_trains_two_members_on_two_devices(engine: str) -> None:
     """PPO ended the process in XLA's partitioner, exit code 134."""
     flags = f"{HASTY} --xla_force_host_platform_device_count=2"
