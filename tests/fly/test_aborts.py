@@ -175,6 +175,7 @@ def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> No
     assert world.running() == [False, False]
 
 
+@pytest.mark.slow
 def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)
@@ -224,6 +225,7 @@ def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
     assert world.running() == [False, False]
 
 
+@pytest.mark.slow
 def test_states_that_break_off_again_and_again_end_the_flight() -> None:
     world = VirtualTwin(FlightSettings(seconds=60.0))
     world.fly_until(State.FLY)

@@ -53,6 +53,7 @@ def cut(track: list[Moment]) -> Moment:
     return next(moment for moment in track if moment.pwm.max() == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drone", [1, *weekly(0)])
 def test_both_stand_before_the_firmware_cuts_a_drone_that_hears_nothing(drone: int) -> None:
     """It was found after 0.5 s, the plan thought that both sink, and the follower was cut at 0.2 m: 1.9 m/s."""
@@ -120,6 +121,7 @@ def test_a_descent_has_the_time_that_its_height_asks() -> None:
         assert FlightSettings().times.descent_limit(height) == pytest.approx(seconds, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_dead_imu_is_told_as_one() -> None:
     """It was "unheard": the log goes on with fresh stamps, and nothing in it moves."""
     world = hovering()

@@ -122,6 +122,7 @@ def test_a_reward_of_the_users_own_replaces_ours() -> None:
     assert (env.input_mask, env.observation_size) == (env.env.input_mask, env.env.observation_size)
 
 
+@pytest.mark.slow
 def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
     config = with_plant(preset("lost"), "team6")
     for reward in (lambda _, action, after: -after.metrics["error"], lambda _, action, after: action[..., 0] - 1.0):
