@@ -67,7 +67,7 @@ def test_the_default_environment_does_not_round_its_products() -> None:
     check_environment("transport", "mjx", gradient=True)
 
 
-@pytest.mark.slow  # three more traces
+@pytest.mark.release  # three more traces
 @rows("preset, physics", [("stand", "mjx"), ("universal", "newton-euler"), ("team", "mjx")])
 def test_other_environments_do_not_round_their_products(preset: str, physics: str) -> None:
     check_environment(preset, physics, gradient=False)

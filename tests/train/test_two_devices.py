@@ -51,7 +51,7 @@ for algorithm in ALGORITHMS:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("engine", TRAINING_ENGINES)
 def test_every_algorithm_trains_two_members_on_two_devices(engine: str) -> None:
     """PPO ended the process in XLA's partitioner, exit code 134."""
