@@ -25,13 +25,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from batch import Batch
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.policies import load_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario

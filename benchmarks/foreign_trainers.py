@@ -85,7 +85,7 @@ class Masked:
 
 def train_brax(config: configs.Config, options: argparse.Namespace, export: Export) -> None:
     """Train with Brax; `export` at every snapshot."""
-    from mjxball.gym.brax_trainers import brax_trainer
+    from brax_trainers import brax_trainer
 
     agent = options.trainer.removeprefix("brax-")
     train = brax_trainer(agent)

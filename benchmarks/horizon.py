@@ -13,11 +13,11 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from batch import Batch
 from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball import config as configs
 from mjxball.config import Config
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import flies_any_rig, load_policy, native_config, team_sizes
 from mjxball.evaluate.scenarios import standard_scenarios

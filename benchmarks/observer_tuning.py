@@ -28,11 +28,11 @@ from typing import Any
 
 import numpy as np
 
+from batch import Batch
 from mjxball.baselines import Mpc, Observer, Pid
 from mjxball.baselines.mpc_design import MpcTuning
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.followers import Baseline
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude

@@ -33,10 +33,10 @@ from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import flies_any_rig, load_policy
-from mjxball.evaluate.random_rigs import AnyRigLaw, Flown, fly, rig_laws
 from mjxball.policy import Policy
 from mjxball.policy.inference import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_config, unpadded
+from random_rigs import AnyRigLaw, Flown, fly, rig_laws
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
 LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]

@@ -36,6 +36,7 @@ import numpy as np
 
 import cells
 import stability
+from batch import Batch
 from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
 from mjxball.arrays import Array
@@ -44,7 +45,6 @@ from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.network import Network
 from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.benchmark import by_variant, run_benchmark
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy

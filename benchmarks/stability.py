@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from batch import Batch, law_of
 from harness import Row, arguments, say, table, write
 from mjxball.arrays import Array
 from mjxball.baselines import make_baseline
@@ -36,7 +37,6 @@ from mjxball.config import Config, preset
 from mjxball.control import rotations
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower, Law
-from mjxball.evaluate.batch import Batch, law_of
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState

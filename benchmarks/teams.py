@@ -1,14 +1,9 @@
-"""Followers of teams: the load on paths in the plane on rings of 2 to 6 drones, and a free ball on a plate.
+"""Followers of teams: the load on paths in the plane on rings of 2 to 6 drones.
 
-Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
+N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
 case counts where `mjxball.plant.trim` finds 15 % margin in every direction and the followers' tilt commands reach it.
 The bar: peak in the plane at most that of `adaptive` + 3 mm, settling at most that of `lqg` + 10 %. 5 drones are in no
 training. With their effort (`effort_of`).
-
-Plate: random starts, the ball within 60 % of the rim with up to 0.1 m/s, both uniform in radius, 60 s, noise level 1.
-Beside them the share of these starts from which friction alone stops the ball before the rim of a level plate. No
-follower can do much better: thrust is normal to the plate, so tilting it accelerates plate and ball alike, and turning
-it only slings the ball outwards.
 """
 
 from __future__ import annotations
@@ -21,27 +16,23 @@ from pathlib import Path
 
 import numpy as np
 
+from batch import Batch
 from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball.baselines import make_baseline
-from mjxball.config import Config, ball_limit, preset
+from mjxball.config import Config, preset
 from mjxball.control.followers import Follower
-from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
-from mjxball.physics.motion import ROLLING_FRICTION
 from mjxball.plant import plant_parameters
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude
-from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import CIRCLE, CgPath, Scenario
 
 SIZES, SPEEDS, AMPLITUDES, MASSES = (2, 3, 4, 5, 6), (0.31, 1.0, 2.0, 3.1), (0.15, 0.3, 0.6), (0.5, 1.0, 1.5)
 EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
 REACH = {CIRCLE: 1.0, EIGHT: math.hypot(1.0, EIGHT.width)}  # farthest CG over the amplitude
 REFERENCES, MORE_PEAK, LATER = ("adaptive", "lqg"), 0.003, 1.1  # the bar: peak of the first [m], settling of the second
-STARTS, SECONDS, INNER, FASTEST = 100, 60.0, 0.6, 0.1
 ENGINE = "newton-euler"
 
 
@@ -50,13 +41,9 @@ def main(given: Sequence[str] | None = None) -> int:
     parser = arguments(__file__, __doc__)
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
     parser.add_argument("--followers", nargs="+", default=["copy"], metavar="NAME", help="baselines (default copy)")
-    parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
     parser.add_argument("--sizes", nargs="+", type=int, choices=SIZES, default=SIZES, help="numbers of drones")
     options = parser.parse_args(given)
-    if tuple(options.sizes) != SIZES and options.plate:
-        raise InputError("--sizes is for the paths; drop it, or --plate")
-    flown = options.policies, options.followers
-    write(options.json, {"rows": plate(*flown) if options.plate else teams(*flown, options.sizes)})
+    write(options.json, {"rows": teams(options.policies, options.followers, options.sizes)})
     return 0
 
 
@@ -132,48 +119,6 @@ def _trimmed(config: Config, mass: float) -> float:
     gain = min(plant_parameters(plant, config.attitude).gains.kp[:2])
     reach = (1 - margin) * len(plant.followers) * gain * config.command.tilt_limit / (plant.gravity * mass)
     return min(reach, *(largest_amplitude(config.plant, mass, margin, (math.cos(a), math.sin(a))) for a in angles))
-
-
-def plate(paths: Sequence[Path], named: Sequence[str]) -> list[Row]:
-    """Flights in which the ball stays off the rim, and what friction alone allows."""
-    config, random = preset("plate"), np.random.default_rng(1)
-    rim, cells, alone = ball_limit(config.plant), [], 0
-    for number in range(STARTS):
-        place, speed = INNER * rim * random.uniform(), FASTEST * random.uniform()
-        at, towards = random.uniform(0, 2 * math.pi, 2)
-        start = place * np.array([math.cos(at), math.sin(at)])
-        velocity = speed * np.array([math.cos(towards), math.sin(towards)])
-        rolled = speed * 7 / 10 / (ROLLING_FRICTION * config.plant.gravity)  # [s] over 2, in which friction stops it
-        alone += float(np.linalg.norm(start + rolled * velocity)) < rim
-        cells.append(
-            Scenario(
-                mass=config.plant.object_mass,
-                amplitude=0.0,
-                ball_start=float(start[0]),
-                ball_start_across=float(start[1]),
-                ball_velocity=(float(velocity[0]), float(velocity[1])),
-                goal=tuple(random.uniform(-1, 1, 3)),
-                seconds=SECONDS,
-                disturbance=Disturbance(noise=1.0, seed=number),
-            )
-        )
-    rows: list[Row] = [{"follower": "friction alone, level", "off_the_rim": alone}]
-    for follower in _followers(config, paths, named):
-        flown = Batch(config, follower, ENGINE).course(cells)
-        distance = np.hypot(flown.cg_offset[..., 0], flown.cg_offset[..., 1]).max(axis=0)
-        error = np.linalg.norm(flown.error[flown.time >= 20], axis=-1).max(axis=0)
-        far = np.linalg.norm(flown.error, axis=-1).max(axis=0) > config.scenario.termination_distance
-        rows.append(
-            {
-                "follower": follower.name,
-                "off_the_rim": int((distance < rim).sum()),
-                "failed": int((far | flown.diverged).sum()),
-                "error_median": float(np.median(error)),
-                "error_worst": float(error.max()),
-            }
-        )
-        say(rows[-1])
-    return rows
 
 
 if __name__ == "__main__":

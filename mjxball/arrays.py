@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -32,6 +33,25 @@ def _has_mask(given: Any) -> bool:
     if isinstance(given, (list, tuple)):
         return any(map(_has_mask, given))
     return isinstance(given, np.ma.MaskedArray)
+
+
+def joined(components: Sequence[Array], axis: int = -1) -> Array:
+    """Arrays of one shape as one, along a new last `axis` (-1) or last but one (-2).
+
+    What `stack` does, of which NumPy's takes twice as long on small arrays.
+    """
+    first = components[0]
+    if isinstance(first, np.ndarray | np.generic):
+        index = (..., None) if axis == -1 else (..., None, slice(None))
+        return np.concatenate([component[index] for component in components], axis=axis)
+    return first.__array_namespace__().stack(components, axis=axis)
+
+
+def clipped(value: Array, low: Any, high: Any) -> Array:
+    """`value` (...) within `low` and `high`: `clip`, of which NumPy's takes twice as long on small arrays."""
+    if isinstance(value, np.ndarray | np.generic):
+        return np.minimum(np.maximum(value, low), high)
+    return value.__array_namespace__().clip(value, low, high)
 
 
 def matmul(a: Array, b: Array) -> Array:

@@ -281,10 +281,6 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
         groups[section] = group
         about = item.metadata["about"].replace("%", "%%")
         group.add_argument(f"--{path}", metavar="VALUE", dest=f"config:{path}", default=None, help=about)
-        for old in configs.old_names(path):
-            group.add_argument(f"--{old}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
-    for path in configs.CONSTANT:
-        parser.add_argument(f"--{path}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
 
 
 def show_defaults(parser: argparse.ArgumentParser, settings: configs.Config) -> None:

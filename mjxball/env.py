@@ -98,7 +98,7 @@ class TransportEnv:
         self._loop = None if self._resets.rigs else self._make_loop()
         self._ball_limit = ball_limit(config.plant)
         self._law = law = follower_law(config)
-        # Calls of their own, which `algorithms.scalar_form` leaves as they are if their arrays are large. A law has no
+        # Calls of their own, which `scalar_form` leaves as they are if their arrays are large. A law has no
         # hash, as `jax.jit` wants; `partial` has.
         parts = self._input, self._answer, law.next if law.size else lambda *_: ()
         self._law_seen, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)

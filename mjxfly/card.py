@@ -41,7 +41,7 @@ def config_of(card: Mapping[str, Any]) -> Config:
     Raises InputError if the card's configuration is none.
     """
     data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
-    data["plant"] = {**data["plant"], **configs.with_current_names({"plant": card["plant"]})["plant"]}
+    data["plant"] = {**data["plant"], **card["plant"]}
     tilt, vertical = card["command_limits"]
     data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"]}
     data["command"] |= {"tilt_limit": tilt, "vertical_limit": vertical}

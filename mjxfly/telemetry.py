@@ -155,7 +155,7 @@ class Rig:
     @classmethod
     def of_card(cls, card: Mapping[str, Any]) -> Rig:
         """The rig that a policy was trained for."""
-        plant: Any = configs.with_current_names({"plant": card["plant"]})["plant"]
+        plant: Any = card["plant"]
         leader = int(plant.get("leader", 0))
         mounts = [tuple(drone["mount"]) for drone in plant["drones"]]
         return cls(mounts[leader], mounts[1 - leader])

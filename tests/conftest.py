@@ -27,7 +27,7 @@ from command_line import HASTY
 from mjxball import cli, xla
 from mjxball import config as configs
 from mjxball.algorithms import sac
-from mjxball.algorithms.base import PolicyNetwork, RecurrentNetwork
+from mjxball.algorithms.base import PolicyNetwork
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.config import Config
 from mjxball.env import TransportEnv
@@ -254,7 +254,7 @@ class Recurrent(NamedTuple):
     """A follower with a GRU, lived-in, and what is needed to run it."""
 
     config: Config
-    network: RecurrentNetwork
+    network: PolicyNetwork
     contents: PolicyFile
 
 
@@ -274,7 +274,7 @@ def recurrent(transport: Config) -> Recurrent:
     network = algorithm.policy(
         state._replace(layers=layers, mean=np.float32(centre), square=square, seen=np.float32(1))
     )
-    assert isinstance(network, RecurrentNetwork)
+    assert network.units
     return Recurrent(config, network, policy_file(config, follower_law(config), network, steps=1234))
 
 

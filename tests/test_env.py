@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from conftest import CompiledEnv, with_settings
 
+from brax_trainers import brax_trainer
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
-from mjxball.gym.brax_trainers import brax_trainer
 from mjxball.quiet import import_brax_env
 
 import_brax_env()  # silently, before Brax's wrappers import it with its notes

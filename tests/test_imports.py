@@ -22,7 +22,7 @@ FLOORS = (
     {"arrays", "reading", "pictures", "terminal"},
     {"files"},
     {"config"},
-    {"xla"},
+    {"xla", "scalar_form"},
     {"cli", "quiet", "plotting"},
     {"plant"},
     {"control"},

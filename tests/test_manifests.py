@@ -33,7 +33,7 @@ def test_the_job_set_numbers_its_pods_as_its_command_says(tmp_path: Path) -> Non
     (tmp_path / "python").chmod(0o755)
     child = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "JOB_COMPLETION_INDEX": "1"}
     done = subprocess.run(container["command"], env=child, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("train.py transport-large ")
+    assert done.stdout.startswith("train.py balance ")
     assert done.stdout.endswith(f" --distributed {meeting}\n")
 
 

@@ -27,7 +27,7 @@ from mjxball.policy import container, file
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.sim import disturbances
 from mjxball.sim.rigs import HELD_OUT_RIGS
-from mjxball.train import lock, loop
+from mjxball.train import loop
 from mjxball.train.program import EVALUATION_SECONDS
 from mjxfly import card, measured, monitor, positioning, preflight, probe, setpoints, takeoff, uri, watchdog
 from mjxfly.app import protocol
@@ -87,7 +87,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
     ),
     "docs/gym": (("`truncated` after # steps", REFERENCE.timing.episode_steps),),
     "docs/training": (
-        ("the lock's age: # s … needs # GB of address", lock.STALE, xla.ADDRESS_SPACE / 1e9),
+        ("needs # GB of address", xla.ADDRESS_SPACE / 1e9),
         ("`mjxball.sim.rigs.held_out` has # rigs", HELD_OUT_RIGS),
     ),
     "docs/view": (("when nothing new came for # s", live.SILENCE),),

@@ -110,7 +110,8 @@ def test_baselines_do_not_round_their_products() -> None:
 
 @pytest.mark.slow  # JaxMARL takes 4 s to import, Brax two
 def test_adapters_do_not_round_their_products() -> None:
-    from mjxball.gym import brax_trainers, core, playground
+    import brax_trainers
+    from mjxball.gym import core, playground
 
     config = configs.replace(configs.preset("transport"), "follower.recurrent_units", 0)
     chains, action = jax.random.split(KEY, 2), jnp.zeros((2, 3))

@@ -18,7 +18,7 @@ from command_line import REPOSITORY, run
 
 pytestmark = pytest.mark.slow
 
-CHECKED = ("physics", "sim", "algorithms", "env", "rewards", "train.program", "evaluate.batch")
+CHECKED = ("physics", "sim", "algorithms", "env", "rewards", "train.program")
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -69,12 +69,12 @@ def is_array(hint: Any) -> bool:
 PROGRAM = """
 import sys, typing
 import brax.envs.base, jax, jaxtyping, mujoco.mjx, optax, scipy.interpolate  # their own are not meant
-sys.path.insert(0, "tests")
+sys.path[:0] = ["tests", "benchmarks"]
 import test_shapes
 typing.TYPE_CHECKING = True
-packages = [f"mjxball.{name}" for name in %r]
+packages = ["batch", *(f"mjxball.{name}" for name in %r)]
 with jaxtyping.install_import_hook(packages, "test_shapes.check"):
-    import mjxball.env, mjxball.evaluate.batch, mjxball.physics.step, mjxball.train.program
+    import batch, mjxball.env, mjxball.physics.step, mjxball.train.program
 typing.TYPE_CHECKING = False
 %s
 print("done")
@@ -84,8 +84,9 @@ import jax
 from conftest import with_settings
 from mjxball import config
 from mjxball.train.program import Program, train
-for preset, physics in (("robust", "mjx"), ("flight", "newton-euler"), ("paper", "newton-euler")):
-    settings = with_settings(config.preset(preset), sac={"num_envs": 8, "batch_size": 8, "replay_size": 8000})
+for preset, physics in (("balance", "mjx"), ("flight", "newton-euler"), ("paper", "newton-euler")):
+    small = {"num_envs": 8, "batch_size": 8, "replay_size": 8000}
+    settings = with_settings(config.preset(preset), sac=small, follower={"recurrent_units": 0})
     program = Program(settings, physics)
     state = jax.eval_shape(program.create, jax.random.key(0))
     jax.eval_shape(program.advance, state, train(1))
@@ -94,7 +95,7 @@ FLIGHTS = """
 import dataclasses
 from mjxball import config
 from mjxball.baselines import make_baseline
-from mjxball.evaluate.batch import Batch
+from batch import Batch
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario

@@ -266,7 +266,7 @@ class TestAgents:
 
 def test_no_tilt_and_no_rotor_pushes_a_free_ball_towards_the_middle() -> None:
     """A ball at rest on the plate: thrust is normal to it, so that its acceleration never points inwards."""
-    config, random, count = preset("plate"), np.random.default_rng(0), 2000
+    config, random, count = configs.with_plant(preset("paper"), "plate4"), np.random.default_rng(0), 2000
     mass, none = np.full(count, config.plant.object_mass), np.zeros(count)
     tilt = 0.3 * random.normal(size=(count, 3))
     place, zero = random.uniform(-0.08, 0.08, (count, 2)), np.zeros((count, 3))

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjxball.arrays import matmul
 from mjxball.config import Config
 from mjxball.control.network import Network
 
@@ -45,32 +44,20 @@ class Schedule(NamedTuple):
 
 
 class PolicyNetwork(NamedTuple):
-    """What is exported: a tanh-squashed network of ReLU layers on normalised observations. A pytree of arrays."""
+    """What is exported: a tanh-squashed network on normalised observations (`Network`). A pytree of arrays.
+
+    With a GRU an observation holds its state behind the network's inputs, and an answer the next state behind the
+    action.
+    """
 
     layers: Any  # Flax's {"hidden_0": {"kernel", "bias"}, ...}; the last gives mean and deviation of the action
+    # and perhaps a GRU below them, "gru": {"kernel", "recurrent", "bias"}
     mean: Float[Array, " n"]  # of the observations
     deviation: Float[Array, " n"]
     mask: Float[Array, " n"]  # 0 for a slot that the policy does not use, else 1
 
-    def __call__(self, observation: Float[Array, "... n"]) -> Float[Array, "... actions"]:
-        """Mean action in [-1, 1] at `observation`."""
-        names = sorted(self.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
-        hidden = (observation - self.mean) / self.deviation * self.mask
-        for name in names[:-1]:
-            hidden = jax.nn.relu(matmul(hidden, self.layers[name]["kernel"]) + self.layers[name]["bias"])
-        last = matmul(hidden, self.layers[names[-1]]["kernel"]) + self.layers[names[-1]]["bias"]
-        return jnp.tanh(last[..., : last.shape[-1] // 2])
-
-
-class RecurrentNetwork(PolicyNetwork):
-    """A GRU below the ReLU layers; `layers` holds it as "gru": {"kernel", "recurrent", "bias"}.
-
-    An observation holds the GRU's state behind the network's inputs, and an answer the next state behind the action
-    (`mjxball.control.network.Network`, which computes it).
-    """
-
     def __call__(self, observation: Float[Array, "... n"]) -> Float[Array, "... answer"]:
-        """Mean action in [-1, 1] at `observation`, and the GRU's next state."""
+        """Mean action in [-1, 1] at `observation`, and the next state of a GRU."""
         return self.network()(observation[..., : self.inputs + self.units])
 
     def outputs(self, observation: Float[Array, "... n"]) -> tuple[Array, Array]:
@@ -80,26 +67,26 @@ class RecurrentNetwork(PolicyNetwork):
 
     @property
     def inputs(self) -> int:
-        """Of the network, the GRU's state not counted."""
-        return self.layers["gru"]["kernel"].shape[-2]
+        """Of the network, a GRU's state not counted."""
+        return self.layers["gru"]["kernel"].shape[-2] if "gru" in self.layers else self.mean.shape[-1]
 
     @property
     def units(self) -> int:
-        """Of the GRU."""
-        return self.layers["gru"]["recurrent"].shape[-2]
+        """Of the GRU, 0 without one."""
+        return self.layers["gru"]["recurrent"].shape[-2] if "gru" in self.layers else 0
 
     def network(self, deviations: bool = False) -> Network:
         """As a policy file has it, without the `deviations` of the action."""
         names = sorted(self.layers.keys() - {"gru"}, key=lambda name: int(name.rsplit("_", 1)[1]))
         weights, biases = ([self.layers[name][part] for name in names] for part in ("kernel", "bias"))
-        columns, own, gru = weights[-1].shape[-1], slice(self.inputs), self.layers["gru"]
+        columns, own, gru = weights[-1].shape[-1], slice(self.inputs), self.layers.get("gru")
         told = slice(columns if deviations else columns // 2)
         return Network(
             weights=(*weights[:-1], weights[-1][..., told]),
             biases=(*biases[:-1], biases[-1][..., told]),
             mean=self.mean[..., own],
             scale=(self.mask[..., own] / self.deviation[..., own]),
-            gru=(gru["kernel"], gru["recurrent"], gru["bias"]),
+            gru=None if gru is None else (gru["kernel"], gru["recurrent"], gru["bias"]),
         )
 
 
@@ -151,7 +138,7 @@ class Environments(Protocol):
         ...
 
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
-        """The same environments, which `transform` of the step of a single one steps instead of its `jax.vmap`."""
+        """The same environments, which `transform` of the step of a single one steps, such as `jax.vmap`."""
         ...
 
     def drawn(self, envs: Any, key: Array) -> Any:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
 from mjxball.algorithms.recurrent import fresh_layers
-from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
+from mjxball.scalar_form import scalar_form
 
 SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
@@ -42,7 +42,7 @@ def _of_all_members(count: int, batched: Any, value: Array) -> tuple[Array, bool
 class GradientState(NamedTuple):
     """What the algorithm knows."""
 
-    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`RecurrentNetwork`)
+    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`PolicyNetwork`)
     adam: Any
     slope: Any  # gradient of the last window's loss, a pytree like `layers`
     loss: Array  # () minus the mean reward of the last window
@@ -74,7 +74,8 @@ class FirstOrderGradient:
         own = config.gradient
         # Number by number a window's gradient takes a quarter of the time, and two thirds to compile; but it has none
         # forwards.
-        self._config, self._environments, self._plain = own, environments.rewritten(scalar_form), environments
+        self._environments, self._plain = (environments.rewritten(form) for form in (scalar_form, jax.vmap))
+        self._config = own
         self._shards = environments.shards
         self._adam = optax.scale_by_adam(*own.adam_betas)
         self.steps_per_collect = own.horizon
@@ -250,8 +251,7 @@ class FirstOrderGradient:
         xp = state.mean.__array_namespace__()  # NumPy's, when a policy file is written: nothing is compiled for that
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
-        network = RecurrentNetwork if self._units else PolicyNetwork
-        return network(state.layers, state.mean, deviation, self._mask)
+        return PolicyNetwork(state.layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
         """Everything that is known is whole."""

@@ -15,7 +15,6 @@ from mjxball.algorithms.base import (
     Environments,
     Phase,
     PolicyNetwork,
-    RecurrentNetwork,
     Schedule,
     Transition,
 )
@@ -155,8 +154,7 @@ class ProximalPolicyOptimization:
     def policy(self, state: PpoState) -> PolicyNetwork:
         """The policy, and what it knows of its observations."""
         mask = jnp.asarray(self._mask, jnp.float32)
-        kind = RecurrentNetwork if self._units else PolicyNetwork
-        return kind(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
+        return PolicyNetwork(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> PpoState:
         """The rollout is cut, the rest is whole."""

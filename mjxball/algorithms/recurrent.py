@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball.algorithms.base import RecurrentNetwork
+from mjxball.algorithms.base import PolicyNetwork
 from mjxball.arrays import Array
 
 SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # control steps that units of a GRU keep their state for at the start
@@ -68,9 +68,7 @@ class RecurrentPolicy(NamedTuple):
 
     def step(self, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
         """(parameters of the action's distribution (..., 2 a), next state (..., H)) at `observation` (..., n)."""
-        network = RecurrentNetwork(
-            policy["params"], statistics.mean, statistics.std, jnp.asarray(self.mask, jnp.float32)
-        )
+        network = PolicyNetwork(policy["params"], statistics.mean, statistics.std, jnp.asarray(self.mask, jnp.float32))
         return network.outputs(observation)
 
     def apply(self, statistics: Any, policy: Any, observation: Array) -> Array:

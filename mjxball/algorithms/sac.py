@@ -13,7 +13,7 @@ import optax
 from jax import Array
 
 from mjxball.algorithms import replay
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
 from mjxball.algorithms.networks import Networks, make_networks
 from mjxball.algorithms.recurrent import answer
 from mjxball.algorithms.replay import Replay, Transitions
@@ -338,8 +338,7 @@ class SoftActorCritic:
         """The running average of the policy, and what it knows of its observations."""
         learner = state.learner
         mask = jnp.asarray(self._mask, jnp.float32)
-        kind = RecurrentNetwork if self._units else PolicyNetwork
-        return kind(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
+        return PolicyNetwork(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> SacState:
         """The replay's rows are cut, the learner is whole."""

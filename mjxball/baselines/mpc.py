@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, clipped, joined
 from mjxball.baselines.mpc_design import (
     LIFT,
     MEASURED,
@@ -53,7 +53,6 @@ from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE, mount_angles
 from mjxball.errors import InputError
-from mjxball.plant.parts import clipped, joined
 
 BLOCKS = (1, 1, 1, 2, 2, 3, 4, 6, 8, 10, 12)  # control steps for which a correction is held: 1 s
 CHECKED = (*range(8), 9, 11, 13, 16, 19, 23, 28, 34, 42)  # control steps at which the limits are kept

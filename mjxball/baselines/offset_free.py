@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array, matmul
+from mjxball.arrays import Array, clipped, joined, matmul
 from mjxball.baselines.assembly_model import pair_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, THETA_NOISE, Tuning, feedback, steady_filter
@@ -20,7 +20,6 @@ from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
-from mjxball.plant.parts import clipped, joined
 
 NAME = "lqg-offset-free"
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=0.003, tilt_limit=0.3)

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, clipped, joined
 from mjxball.baselines.assembly_model import pair_model
 from mjxball.config import Config
 from mjxball.control import leader
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
-from mjxball.plant.parts import clipped, joined
 
 
 class PidGains(NamedTuple):

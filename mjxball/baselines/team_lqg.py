@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array, matmul
+from mjxball.arrays import Array, clipped, joined, matmul
 from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, Tuning, feedback, steady_filter
@@ -23,7 +23,6 @@ from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
-from mjxball.plant.parts import clipped, joined
 
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=20.0, tilt_limit=0.3)  # of a load's torque over the inertia
 # [s] in which the estimates of d, d' and the lift error are forgotten.

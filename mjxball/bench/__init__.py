@@ -1,7 +1,7 @@
 """mjxball-bench: the same flights for every follower, held against classical followers that know the plant.
 
 `tracks` says what is flown, `followers` how a follower of any origin is loaded, `score` what is measured and when a
-flight is met, `entry` what is written; docs/leaderboard.py makes the page of entries. What a version flies and counts
+flight is met, `entry` what is written; docs/leaderboard.py makes tables of entries. What a version flies and counts
 never changes.
 """
 

@@ -10,7 +10,6 @@ from mjxball.config._plant import Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
 from mjxball.config._plausible import check_lift, thrust_over_weight, total_mass
 from mjxball.config._presets import PRESETS, preset
-from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
 from mjxball.config._rigs import Rigs
 from mjxball.config._settings import (
     Attitude,
@@ -42,11 +41,9 @@ from mjxball.config._tree import (
 from mjxball.config._validate import ball_limit, cg_limit, validate
 
 __all__ = [
-    "CONSTANT",
     "PLANTS",
     "PLANT_PARTS",
     "PRESETS",
-    "RENAMED",
     "Attitude",
     "Autopilot",
     "Bounds",
@@ -72,12 +69,10 @@ __all__ = [
     "cg_limit",
     "check_lift",
     "config_hash",
-    "current_name",
     "follow_plant",
     "from_dict",
     "from_record",
     "leaves",
-    "old_names",
     "override",
     "preset",
     "range_of",
@@ -89,6 +84,5 @@ __all__ = [
     "to_text",
     "total_mass",
     "validate",
-    "with_current_names",
     "with_plant",
 ]

@@ -13,7 +13,6 @@ from mjxball.config._model import Told, read_model
 from mjxball.config._model_plant import plant_of
 from mjxball.config._model_source import MODELS
 from mjxball.config._plant import Plant
-from mjxball.config._renamed import current_name
 from mjxball.config._settings import Config
 from mjxball.config._tree import apply_overrides, leaves, override
 from mjxball.config._validate import MOST_DRONES, check_leaves, validate
@@ -178,7 +177,7 @@ def with_plant(
         for path, text in flags.items():
             changed = override(changed, path, text)
         check_leaves(changed)
-        said = {current_name(path) for path in (*settings, *flags)}
+        said = {*settings, *flags}
         changed = validate(follow_plant(changed, config.plant, said))
         if DRONES in settings:
             _check_inertias(changed.plant)

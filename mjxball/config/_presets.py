@@ -71,10 +71,9 @@ def _transport() -> Config:
     )
 
 
-def _transport_large() -> Config:
-    """What `transport` becomes with a GPU: all loads that one drone can trim, and a memory."""
+def _large() -> Config:
+    """What larger trainings share: all loads that one drone can trim, a little of everything late and noisy."""
     return Config(
-        preset="transport-large",
         follower=Follower(action_scale_tilt=0.3, observation_averages=(0.05, 0.2), privileged_critic=True),
         scenario=ScenarioRanges(
             cg_speed=(0.2, 3.2),
@@ -82,7 +81,7 @@ def _transport_large() -> Config:
             object_mass=(0.1, 0.6),
             start_velocity=0.2,
             start_tilt=0.05,
-            # A little of everything late and noisy, or the command chatters between its limits.
+            # Without it the command chatters between its limits.
             noise=(0.0, 1.0),
             delay=(0.0, 0.04),
             rotor_lag_scale=(0.7, 1.4),
@@ -91,30 +90,6 @@ def _transport_large() -> Config:
         # Speed is dear so that the goal is not overshot, changes of the command so that noise ends before the rotors.
         reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
         sac=replace(LARGE_SAC, total_steps=2_048_000, discount=0.97, n_step=5, learning_rate=3e-3),
-    )
-
-
-def _robust() -> Config:
-    """`transport-large` with a mass that nobody knows and that changes, gusts, and rotors that differ more."""
-    large = _transport_large()
-    return replace(
-        large,
-        preset="robust",
-        follower=replace(large.follower, action_scale_vertical=6.0, observation_averages=(0.05, 0.2, 1.0)),
-        scenario=replace(
-            large.scenario,
-            object_mass=(0.1, 0.32),
-            mass_known=False,
-            mass_change=(-0.05, 0.06),
-            gust=(0.0, 0.3),
-            rotor_lag_scale=(0.5, 2.0),
-            thrust_scale=(0.8, 1.2),
-            inertia_scale=(0.6, 1.4),
-            cg_waypoint_probability=0.3,
-        ),
-        bounds=Bounds(x_peak=0.03, settling_time=3.5, rmse=0.355),
-        reward=replace(large.reward, velocity=12.0, smoothness=10.0),
-        sac=replace(large.sac, total_steps=4_096_000, replay_size=1_024_000, learning_rate=2e-3),
     )
 
 
@@ -133,7 +108,7 @@ RECURRENT = Follower(previous_action=True, recurrent_units=64)
 
 def _balance() -> Config:
     """One follower for loads known and unknown: a recurrent network that is trained by gradients."""
-    large = _transport_large()
+    large = _large()
     return replace(
         large,
         preset="balance",
@@ -194,7 +169,7 @@ TEAM_GRADIENT = replace(RECURRENT_GRADIENT, policy_layers=(48,), horizon=150)
 
 def _team() -> Config:
     """Two to six drones on a ring, one policy for all followers of all teams; the load moves in the plane."""
-    large = _transport_large()
+    large = _large()
     return replace(
         apply_overrides(large, read_plant("team6").settings),
         preset="team",
@@ -250,7 +225,7 @@ def _lost() -> Config:
 
 def _universal() -> Config:
     """One follower for teams of any drones and loads, told where they are mounted alone."""
-    large = _transport_large()
+    large = _large()
     team = apply_overrides(large, read_plant("team6").settings)
     return replace(
         team,
@@ -282,35 +257,10 @@ def _universal() -> Config:
     )
 
 
-def _plate() -> Config:
-    """Four drones at the corners of a plate, on which a free ball rolls that nobody measures."""
-    large = _transport_large()
-    return replace(
-        apply_overrides(large, read_plant("plate4").settings),
-        preset="plate",
-        follower=replace(large.follower, observation_averages=(0.05, 0.2, 1.0)),
-        scenario=replace(
-            large.scenario,
-            cg_amplitude=(0.0, 0.0),
-            object_mass=(0.2, 0.2),
-            ball_start=0.1,
-            ball_speed=0.15,
-        ),
-        reward=replace(large.reward, ball=5.0),
-        bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.5),
-        sac=replace(large.sac, num_envs=510, replay_size=510_000),
-        ppo=Ppo(num_envs=528),
-        gradient=TEAM_GRADIENT,
-    )
-
-
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
     {
         made.preset: made
-        for made in (
-            *(_transport(), _paper(), _transport_large(), _robust(), _balance()),
-            *(_team(), _lost(), _plate(), _universal(), stand(), flight()),
-        )
+        for made in (_transport(), _paper(), _balance(), _team(), _lost(), _universal(), stand(), flight())
     }
 )
 

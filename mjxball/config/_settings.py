@@ -181,7 +181,6 @@ class ScenarioRanges:
         (0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]", low=-1e5, high=1e5
     )
     ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0, high=1e4)
-    ball_speed: float = setting(0.0, "rolling: it starts with up to this speed [m/s]", low=0, high=100)
     noise: Range = drawn(
         (0.0, 0.0), "measurement noise, in standard deviations of motion capture and IMU", low=0, high=100
     )

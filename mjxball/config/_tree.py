@@ -11,12 +11,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mjxball.config._plant import Drone
-from mjxball.config._renamed import CONSTANT, check_constant, current_name, with_current_names
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
 from mjxball.reading import near, shown
 
 MAX_LISTED = 6
+LAST_VERSION = "0.1.0"  # of mjxball that reads settings under the names and values of before
 
 
 def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field]]:
@@ -73,11 +73,8 @@ def override(config: Config, path: str, text: str) -> Config:
 
     Raises InputError for an unknown path or a text that does not parse to the leaf's type.
     """
-    if path in CONSTANT:
-        check_constant(path, _parse(path, text, CONSTANT[path], float))
-        return config
     for known, value, item in leaves(config):
-        if known == current_name(path):
+        if known == path:
             whole = "int" in str(item.type)
             return replace(config, known, _parse(path, text, value, int if whole else float))
     raise InputError(f"--{path} is not a setting; run with --help for the list")
@@ -89,11 +86,7 @@ def apply_overrides(config: Config, values: Mapping[str, Any]) -> Config:
     Raises InputError for an unknown path.
     """
     known = {path: value for path, value, _ in leaves(config)}
-    for given, value in values.items():
-        path = current_name(given)
-        if path in CONSTANT:
-            check_constant(path, value)
-            continue
+    for path, value in values.items():
         if path == "plant.drones":
             config = replace(config, path, _drones(value))
             known = {path: value for path, value, _ in leaves(config)}
@@ -130,12 +123,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
-    """Rebuild a configuration from `to_dict`'s output or parsed JSON, with present or earlier names.
-
-    Raises InputError on any mismatch.
-    """
-    if kind is Config:
-        data = with_current_names(data)
+    """Rebuild a configuration from `to_dict`'s output or parsed JSON. Raises InputError on any mismatch."""
     if not isinstance(data, dict):
         raise InputError(f"configuration {path or 'root'} must be an object")
     hints = typing.get_type_hints(kind)
@@ -146,7 +134,8 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
         where = f" in {path}" if path else ""
         spelt = [f"unknown {str(name)[:60]}{near(str(name)[:60], names)}" for name in unknown[:MAX_LISTED]]
         what = ", ".join(spelt + [f"missing {name}" for name in missing][:MAX_LISTED])
-        raise InputError(f"configuration does not fit this version{where}: {what}")
+        last = f"; mjxball {LAST_VERSION} is the last version that reads settings of earlier ones" if unknown else ""
+        raise InputError(f"configuration does not fit this version{where}: {what}{last}")
     values = {}
     for name in names:
         value = data[name]
@@ -192,7 +181,7 @@ def from_record(data: Any) -> Any:
     """
     if isinstance(data, dict) and "plant" not in data:
         raise InputError("configuration does not fit this version: missing plant")
-    return from_dict(_completed(with_current_names(data), to_dict(Config())))
+    return from_dict(_completed(data, to_dict(Config())))
 
 
 def _completed(data: Any, default: Any) -> Any:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, clipped, joined
 from mjxball.control import mixer
 from mjxball.plant.parameters import AttitudeGains
-from mjxball.plant.parts import clipped, joined
 
 
 def rotor_commands(
@@ -36,5 +35,4 @@ def rotor_commands(
     torque = kp * (desired - euler) - kd * rates
     wrench = mixer.turned(xp.concat([thrust[..., None], torque], axis=-1), -yaw)
     rotors = mixer.rotors_from_wrench(wrench, arm, yaw_per_thrust, layout)
-    most = rotor_force_max if isinstance(rotor_force_max, float) else rotor_force_max[..., None]
-    return clipped(rotors, 0.0, most)
+    return clipped(rotors, 0.0, xp.asarray(rotor_force_max, dtype=rotors.dtype)[..., None])

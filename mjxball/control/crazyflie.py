@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, clipped, joined
 from mjxball.config import Autopilot
-from mjxball.plant.parts import clipped, joined
 
 PERIOD = 0.002  # [s] of the attitude and rate loops: 500 Hz
 FULL = 65535.0  # motor command of full power

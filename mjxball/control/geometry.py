@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, joined
 from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.control.observation import mount_frames
-from mjxball.plant.parts import joined
 
 GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_per_lift", "rotor_room")
 GEOMETRY_SIZE = len(GEOMETRY)

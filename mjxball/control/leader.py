@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from mjxball.arrays import Array
-from mjxball.plant import parts
+import math
+
+from mjxball.arrays import Array, clipped, joined
 
 
 def desired_acceleration(error: Array, error_rate: Array, integral: Array, kp: Array, kd: Array, ki: Array) -> Array:
@@ -17,15 +18,15 @@ def command(acceleration: Array, yaw: Array | float, gravity: float, tilt_limit:
     phi = (ax sin psi - ay cos psi) / g, theta = (ax cos psi + ay sin psi) / g at the desired `yaw`
     (the paper's equations after eq. 5; both drones fly at psi = 0), clipped to the limits.
     """
-    ax, ay, az = parts.split(acceleration)
-    cosine, sine = parts.cosine_and_sine(yaw)
-    roll = parts.minus(parts.times(ax, sine), parts.times(ay, cosine)) / gravity
-    pitch = parts.plus(parts.times(ax, cosine), parts.times(ay, sine)) / gravity
-    return clip_command(parts.joined([roll, pitch, az]), tilt_limit, vertical_limit)
+    ax, ay, az = (acceleration[..., i] for i in range(3))
+    functions = math if isinstance(yaw, float) else yaw.__array_namespace__()
+    cosine, sine = functions.cos(yaw), functions.sin(yaw)
+    roll, pitch = (ax * sine - ay * cosine) / gravity, (ax * cosine + ay * sine) / gravity
+    return clip_command(joined([roll, pitch, az]), tilt_limit, vertical_limit)
 
 
 def clip_command(value: Array, tilt_limit: float, vertical_limit: float) -> Array:
     """Clip (roll, pitch, vertical acceleration) (..., 3) to +-(tilt_limit, tilt_limit, vertical_limit)."""
     xp = value.__array_namespace__()
     limit = xp.asarray([tilt_limit, tilt_limit, vertical_limit], dtype=value.dtype)
-    return parts.clipped(value, -limit, limit)
+    return clipped(value, -limit, limit)

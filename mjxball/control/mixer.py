@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mjxball.arrays import Array
-from mjxball.plant.parts import joined
+from mjxball.arrays import Array, joined
 from mjxball.plant.rotors import lever
 
 

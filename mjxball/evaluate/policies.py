@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball import config as configs
-from mjxball.config import Config, with_current_names
+from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
@@ -47,7 +47,7 @@ def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
     period = config.timing.control_period
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
-    made_for = configs.from_record({"plant": policy.card["plant"]}).plant
+    made_for = _of_card(path, {"plant": policy.card["plant"]}).plant
     if flies_any_rig(policy):
         if config.plant.stand != "free":
             raise InputError(f"{path} was made for free flight, not for a stand")
@@ -72,6 +72,14 @@ def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
     return policy
 
 
+def _of_card(name: Path | str, record: dict[str, Any]) -> Config:
+    """The configuration that the card of the policy `name` holds; InputError, which names the policy, if it is none."""
+    try:
+        return configs.from_record(record)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
 def flies_any_rig(policy: Policy) -> bool:
     """Whether `policy` flies any rig, of which it is told where the drones are mounted alone."""
     return law_of(policy.card).geometry and trained_rigs(policy).rigs.number > 0
@@ -80,15 +88,12 @@ def flies_any_rig(policy: Policy) -> bool:
 def trained_rigs(policy: Policy) -> Config:
     """The configuration that a policy for any rig was trained with; the preset's where its card has none."""
     settings = policy.card.get("config")
-    return configs.from_record(settings) if isinstance(settings, dict) else configs.preset("universal")
+    return _of_card(policy.name, settings) if isinstance(settings, dict) else configs.preset("universal")
 
 
 def team_sizes(policy: Policy) -> tuple[int, ...]:
     """Numbers of drones of the teams that `policy` was trained in; () if it was made for one plant."""
-    trained = with_current_names(policy.card.get("config"))
-    scenario = trained.get("scenario") if isinstance(trained, dict) else None
-    sizes = scenario.get("team_sizes") if isinstance(scenario, dict) else None
-    return tuple(sizes) if isinstance(sizes, list) and all(isinstance(size, int) for size in sizes) else ()
+    return _of_card(policy.name, {"plant": {}, **policy.card.get("config", {})}).scenario.team_sizes
 
 
 def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> None:
@@ -102,14 +107,12 @@ def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> N
 
 def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None:
     """Refuse a policy whose leader or attitude loop was another than the one that it would fly with."""
-    trained = with_current_names(card.get("config"))
-    if not isinstance(trained, dict):
+    if "config" not in card:
         return
+    trained = _of_card(path, {"plant": {}, **card["config"]})
     for section in ("leader", "attitude"):
-        for key, value in dataclasses.asdict(getattr(config, section)).items():
-            made_for = (trained.get(section) or {}).get(key, value)
-            made_for = tuple(made_for) if isinstance(made_for, list) else made_for
-            if made_for != value:
+        for key, made_for in dataclasses.asdict(getattr(trained, section)).items():
+            if made_for != (value := getattr(getattr(config, section), key)):
                 raise InputError(f"{path} was trained with {section}.{key} {made_for!r}, not {value!r}")
 
 
@@ -128,7 +131,7 @@ def native_config(path: Path) -> Config | None:
     settings = Policy.load(path).card.get("config")
     if not isinstance(settings, dict):
         return None
-    found = configs.validate(configs.from_record(settings))
+    found = configs.validate(_of_card(path, settings))
     paper = found.autopilot.kind == "ideal" and found.plant == configs.preset("paper").plant
     return None if paper else found
 

@@ -70,14 +70,6 @@ TEAM_SUITES: tuple[Suite, ...] = (
         ),
     ),
     Suite(
-        "team-plate",
-        "four drones carry a plate on which a ball rolls freely; nobody measures it",
-        "start",
-        tuple(
-            Variant(f"{100 * x:g} cm", Scenario(amplitude=0.0, ball_start=x), team="plate") for x in (0.02, 0.05, 0.08)
-        ),
-    ),
-    Suite(
         "team-weak",
         "of four drones the follower opposite to the leader gives less thrust than it is asked for",
         "its thrust",

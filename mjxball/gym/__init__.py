@@ -1,9 +1,9 @@
 """Gymnasium environments: `import mjxball.gym`, then `gymnasium.make("mjxball/Transport-v0")`.
 
-Every preset of a pair is registered, `transport-large` as `mjxball/TransportLarge-v0`. `gymnasium.make` gives one world
-on C MuJoCo, `gymnasium.make_vec(..., num_envs=N, vectorization_mode="vector_entry_point")` N worlds on MJX.
-Observation, reward, endings and the worlds that are drawn are those of `mjxball.env`. Teams, whose followers are
-several agents, are `mjxball.gym.parallel.FollowersParallelEnv`, for PettingZoo.
+Every preset of a pair is registered. `gymnasium.make` gives one world on C MuJoCo, `gymnasium.make_vec(...,
+num_envs=N, vectorization_mode="vector_entry_point")` N worlds on MJX. Observation, reward, endings and the worlds that
+are drawn are those of `mjxball.env`. Teams, whose followers are several agents, are
+`mjxball.gym.parallel.FollowersParallelEnv`, for PettingZoo.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["environment_id"]
 
 def environment_id(preset: str) -> str:
     """Gymnasium's name of `preset`."""
-    return f"mjxball/{''.join(part.capitalize() for part in preset.split('-'))}-v0"
+    return f"mjxball/{preset.capitalize()}-v0"
 
 
 for _preset in (name for name, config in PRESETS.items() if config.plant.count == 2):

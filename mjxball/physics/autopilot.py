@@ -9,8 +9,7 @@ from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import attitude, crazyflie, motors, rotations
 from mjxball.physics.engine import Load, PlantState
-from mjxball.plant import PlantParameters, parts, plant_parameters
-from mjxball.plant.parameters import shared
+from mjxball.plant import PlantParameters, plant_parameters
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -36,12 +35,12 @@ def rotor_targets(
         state.rates[..., None, :],
         carried_mass(numbers, state, believed_mass),
         numbers.gains,
-        parts.entry(numbers.gravity),
-        shared(numbers.arm, commands),
-        shared(numbers.yaw_per_thrust, commands),
-        shared(numbers.rotor_force_max, commands),
+        numbers.gravity,
+        numbers.arm,
+        numbers.yaw_per_thrust,
+        numbers.rotor_force_max,
         config.plant.layout,
-        shared(numbers.yaw, commands),
+        numbers.yaw,
     )
 
 

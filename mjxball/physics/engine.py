@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mjxball import arrays
 from mjxball.arrays import Array
 from mjxball.config import Plant
 from mjxball.control import mixer, rotations
-from mjxball.plant import PlantParameters, parts
-from mjxball.plant.parameters import of_drone, own_inertia, shared
+from mjxball.plant import PlantParameters
+from mjxball.plant.parameters import own_inertia
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     Vector = Float[Array, "... 3"]
 # A flight beyond one of these has diverged: the physics no longer holds, and no flight came back from there.
 MAX_POSITION, MAX_RATE = 1e3, 50.0  # [m] each coordinate, [rad/s] norm
+UPWARDS = np.array([0.0, 0.0, 1.0], np.float32)  # e3
 
 
 class PlantState(NamedTuple):
@@ -59,7 +61,16 @@ def coordinates(value: Coordinates, directions: int) -> list[Scalar]:
 
 def joined(values: Sequence[Scalar]) -> Coordinates:
     """The inverse of `coordinates`."""
-    return values[0] if len(values) == 1 else parts.joined(values)
+    return values[0] if len(values) == 1 else arrays.joined(values)
+
+
+def solve_small(matrix: Any, vector: Any) -> list[Scalar]:
+    """Solve one or two equations, given as sequences or arrays."""
+    if len(vector) == 1:
+        return [vector[0] / matrix[0][0]]
+    (a, b), (c, d) = matrix
+    determinant = a * d - b * c
+    return [(d * vector[0] - b * vector[1]) / determinant, (a * vector[1] - c * vector[0]) / determinant]
 
 
 class PathShape(NamedTuple):
@@ -120,27 +131,16 @@ def rotor_wrenches(
     plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"]
 ) -> Float[Array, "... drones 4"]:
     """(T, tau_x, tau_y, tau_z) [N, N m] of each drone's rotors about its own centre, body axes."""
-    arm, yaw_moment, yaw = (
-        shared(value, rotor_force) for value in (parameters.arm, parameters.yaw_per_thrust, parameters.yaw)
-    )
-    return mixer.turned(mixer.wrench_from_rotors(rotor_force, arm, yaw_moment, plant.layout), yaw)
+    wrench = mixer.wrench_from_rotors(rotor_force, parameters.arm, parameters.yaw_per_thrust, plant.layout)
+    return mixer.turned(wrench, parameters.yaw)
 
 
 def total_wrench(plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"]) -> Wrench:
-    """Wrench about O of all rotors, `rotor_force` [N]."""
+    """Wrench about O of all rotors, `rotor_force` [N]: T e3 and the sum of tau_i + r_i x T_i e3 over the drones."""
     drones = rotor_wrenches(plant, parameters, rotor_force)
-    along_x: parts.Part = 0.0
-    along_y: parts.Part = 0.0
-    thrust: parts.Part = 0.0
-    torque = parts.ZERO
-    for number in range(parameters.size):
-        lift, *own = (drones[..., number, k] for k in range(4))
-        _, _, mount, _ = of_drone(parameters, number)
-        thrust, torque = parts.plus(thrust, lift), parts.add(torque, (own[0], own[1], own[2]))
-        along_x = parts.plus(along_x, parts.times(mount[0], lift))
-        along_y = parts.plus(along_y, parts.times(mount[1], lift))
-    levers = (along_y, parts.minus(0.0, along_x), 0.0)
-    return Wrench(parts.stacked((0.0, 0.0, thrust), thrust), parts.stacked(parts.add(torque, levers), thrust))
+    thrust = drones[..., :1] * UPWARDS
+    torque = drones[..., 1:] + rotations.cross(parameters.mounts, thrust)
+    return Wrench(thrust.sum(axis=-2), torque.sum(axis=-2))
 
 
 def contact_wrenches(
@@ -153,23 +153,14 @@ def contact_wrenches(
     tau_i = tau_rotor,i - w x I_i w - I_i w', torques about each drone's own centre.
     """
     matrix = rotations.matrix_from_quaternion(state.quaternion)
-    rates, down = parts.split(state.rates), parts.split(matrix[..., 2, :])
-    body, turning = parts.split(rotations.rotate_back(matrix, linear)), parts.split(angular)
-    held = parts.add(parts.scale(parts.entry(parameters.gravity), down), body)
+    held = parameters.gravity * matrix[..., 2, :] + rotations.rotate_back(matrix, linear)
+    held, rates, turning = (vector[..., None, :] for vector in (held, state.rates, angular))
+    mounts, own, cross = parameters.mounts, own_inertia(parameters), rotations.cross
+    lever = cross(turning, mounts) + cross(rates, cross(rates, mounts))
     rotors = rotor_wrenches(plant, parameters, state.rotor_force)
-    forces, torques = [], []
-    for drone in range(parameters.size):
-        mass, _, mount, _ = of_drone(parameters, drone)
-        own = own_inertia(parameters, drone)
-        lever = parts.add(parts.cross(turning, mount), parts.cross(rates, parts.cross(rates, mount)))
-        thrust, *about = (rotors[..., drone, k] for k in range(4))
-        force = parts.subtract((0.0, 0.0, thrust), parts.scale(mass, parts.add(held, lever)))
-        gyration = parts.cross(rates, parts.rotate(own, rates))
-        spun = parts.subtract((about[0], about[1], about[2]), gyration)
-        torque = parts.subtract(spun, parts.rotate(own, turning))
-        forces.append(parts.stacked(force, thrust))
-        torques.append(parts.stacked(torque, thrust))
-    return parts.joined(forces, axis=-2), parts.joined(torques, axis=-2)
+    force = rotors[..., :1] * UPWARDS - parameters.drone_mass[..., None] * (held + lever)
+    torque = rotors[..., 1:] - cross(rates, rotations.rotate(own, rates)) - rotations.rotate(own, turning)
+    return force, torque
 
 
 def has_diverged(plant: PlantState) -> Bool[Array, "..."]:

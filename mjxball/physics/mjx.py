@@ -12,8 +12,8 @@ from mjxball.arrays import matmul
 from mjxball.assembly import ASSEMBLY, BALL, build_model, drone_names
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
-from mjxball.plant import ROLLING_INERTIA, PlantParameters, parts, plant_parameters
+from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, solve_small
+from mjxball.plant import ROLLING_INERTIA, PlantParameters, plant_parameters
 from mjxball.quiet import import_mjx
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
     assembly is or on its linear velocity, so both are zero here: that keeps float32 at its best.
     """
     stages = _Stages(plant, plant_parameters(plant, attitude), parameters)
-    share = parts.entry(stages.numbers.moving_fraction)
+    share = stages.numbers.moving_fraction
 
     def prescribed(
         state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
@@ -57,7 +57,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
         recoils = [_solve(mass[:n, :n], -mass[:n, n + k]) for k in slides]
         driving = [pushed[k] - bias[n + k] - matmul(mass[n + k, :n], driven) for k in slides]
         inertia = [[mass[n + i, n + j] + matmul(mass[n + i, :n], recoils[j]) for j in slides] for i in slides]
-        ball = parts.solve_small(inertia, driving)
+        ball = solve_small(inertia, driving)
         for acceleration, recoil in zip(ball, recoils, strict=True):
             driven = driven + acceleration * recoil
         return *stages.result(state, driven), ball[0] if stages.slides == 1 else jnp.stack(ball)
@@ -123,12 +123,12 @@ class _Stages:
     def _loaded(self, object_mass: Scalar, dtype: Any) -> Any:
         m, own = self._model, self.numbers
         mass, inertia, armature = (a.astype(dtype) for a in (m.body_mass, m.body_inertia, m.dof_armature))
-        share = parts.entry(own.moving_fraction)
+        share = own.moving_fraction
         moving = object_mass * share
         mass = mass.at[self._ball].set(moving)
         inertia = inertia.at[self._ball].set(object_mass * jnp.asarray(own.ball_inertia_per_mass, dtype))
         if not self._fused:
-            mass = mass.at[self._assembly].set(object_mass * (1 - share) + parts.entry(own.carrier_mass))
+            mass = mass.at[self._assembly].set(object_mass * (1 - share) + own.carrier_mass)
             shell = object_mass * jnp.asarray(own.shell_inertia_per_mass, dtype)
             inertia = inertia.at[self._assembly].set(shell + jnp.asarray(own.carrier_inertia, dtype))
         changed = {}
@@ -184,11 +184,11 @@ def _mass_matrix(model: Any, data: Any) -> Float[Array, "nv nv"]:
 def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:
     """Solve M a = f for the root: 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
     if len(force) <= 2:
-        return jnp.stack(parts.solve_small(mass, force))
+        return jnp.stack(solve_small(mass, force))
     total, coupling = mass[0, 0], mass[3:, :3]
     rows = [coupling[i] for i in range(3)]
     squares = jnp.stack([jnp.stack([rotations.dot(a, b) for b in rows]) for a in rows])
     push = jnp.stack([rotations.dot(row, force[:3]) for row in rows])
-    angular = rotations.solve_symmetric(mass[3:, 3:] - squares / total, force[3:] - push / total)
+    angular = rotations.solve(mass[3:, 3:] - squares / total, force[3:] - push / total)
     back = rotations.rotate_back(coupling, angular)
     return jnp.concatenate([(force[:3] - back) / total, angular])

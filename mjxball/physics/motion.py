@@ -12,7 +12,7 @@ from mjxball.arrays import Array
 from mjxball.config import Config, cg_limit
 from mjxball.errors import InputError
 from mjxball.physics.engine import CgState, Load, PathShape, joined
-from mjxball.plant import PlantParameters, parts, plant_parameters
+from mjxball.plant import PlantParameters, plant_parameters
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -173,7 +173,7 @@ def make_rolling_force(
     the radius alone.
     """
     numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    end, gravity = parts.entry(numbers.ball_limit), parts.entry(numbers.gravity)
+    end, gravity = numbers.ball_limit, numbers.gravity
     directions = len(config.plant.directions)
     stiffness = 1.4 * STOP_FREQUENCY**2
     damping = 1.4 * 2 * STOP_DAMPING * STOP_FREQUENCY

@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, clipped
 from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import motion
 from mjxball.physics.autopilot import Autopilot, make_autopilot
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench, total_wrench
-from mjxball.plant import PlantParameters, parts, plant_parameters
-from mjxball.plant.parameters import shared
+from mjxball.plant import PlantParameters, plant_parameters
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -74,7 +73,7 @@ def make_control_step(
 
     def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         loops, target = autopilot(state, commands, load)
-        keep, mean = rotor_shares(shared(numbers.rotor_lag, state.rotor_force), load.rotor_lag_scale, h)
+        keep, mean = rotor_shares(numbers.rotor_lag, load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
         if load.thrust_fade is not None:
@@ -119,7 +118,7 @@ def make_accelerations(
     The ball's acceleration is 0 for prescribed motions, whose offset is a function of time alone.
     """
     numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    share = parts.entry(numbers.moving_fraction)
+    share = numbers.moving_fraction
     if config.motion.kind == "rolling":
         force = motion.make_rolling_force(config, numbers)
 
@@ -163,8 +162,8 @@ def hover_rotor_force(
     xp = believed_mass.__array_namespace__()
     numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
     own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.known_mass, numbers.load_share))
-    per_rotor = (own + share * believed_mass[..., None]) * parts.entry(numbers.gravity) / 4
-    per_rotor = xp.clip(per_rotor, 0.0, shared(numbers.rotor_force_max, per_rotor))
+    per_rotor = (own + share * believed_mass[..., None]) * numbers.gravity / 4
+    per_rotor = clipped(per_rotor, 0.0, numbers.rotor_force_max)
     return xp.stack([per_rotor] * 4, axis=-1)
 
 

@@ -7,14 +7,12 @@ may have its own.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, joined
 from mjxball.config import Attitude, Plant, ball_limit
-from mjxball.plant import parts
-from mjxball.plant.parts import Part, Parts, Rows
 
 ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
 
@@ -56,7 +54,7 @@ class PlantParameters(NamedTuple):
     @property
     def drone_inertia(self) -> np.ndarray:
         """(3, 3) inertia about O of all drones and the carrier, body axes [kg m2]; of constants alone."""
-        return np.array(rigid_inertia(self))
+        return rigid_inertia(self)
 
     @property
     def size(self) -> int:
@@ -64,65 +62,40 @@ class PlantParameters(NamedTuple):
         return int(self.drone_mass.shape[-1])
 
 
-def of_drone(parameters: PlantParameters, number: int) -> tuple[Part, Parts, Parts, Part]:
-    """(mass, own principal inertia, mount, yaw) of drone `number`."""
-    inertia, mount = (
-        (parts.entry(array, number, 0), parts.entry(array, number, 1), parts.entry(array, number, 2))
-        for array in (parameters.own_inertia, parameters.mounts)
-    )
-    yaw = parts.entry(parameters.yaw, number)
-    return parts.entry(parameters.drone_mass, number), inertia, mount, yaw
+def rigid_mass(parameters: PlantParameters) -> Array:
+    """() of all drones and the carrier [kg]."""
+    return parameters.drone_mass.sum(axis=-1) + parameters.carrier_mass
 
 
-def rigid_mass(parameters: PlantParameters) -> Part:
-    """Of all drones and the carrier [kg]."""
-    drones = [parts.entry(parameters.drone_mass, number) for number in range(parameters.size)]
-    return parts.total([*drones, parts.entry(parameters.carrier_mass)])
+def rigid_moment(parameters: PlantParameters) -> Array:
+    """(3,) sum of m_i r_i over the drones [kg m]; the carrier's centre is O."""
+    return (parameters.drone_mass[..., None] * parameters.mounts).sum(axis=-2)
 
 
-def rigid_moment(parameters: PlantParameters) -> Parts:
-    """Sum of m_i r_i over the drones [kg m]; the carrier's centre is O."""
-    found = parts.ZERO
-    for number in range(parameters.size):
-        mass, _, mount, _ = of_drone(parameters, number)
-        found = parts.add(found, parts.scale(mass, mount))
-    return found
+def rigid_inertia(parameters: PlantParameters) -> Array:
+    """(3, 3) about O, of all drones and the carrier, body axes [kg m2]."""
+    far = parameters.drone_mass[..., None, None] * point_inertia(parameters.mounts)
+    return own_inertia(parameters).sum(axis=-3) + far.sum(axis=-3) + diagonal(parameters.carrier_inertia)
 
 
-def rigid_inertia(parameters: PlantParameters) -> Rows:
-    """About O, of all drones and the carrier, body axes [kg m2]."""
-    own: Rows = (parts.ZERO,) * 3
-    far: Rows = (parts.ZERO,) * 3
-    for number in range(parameters.size):
-        mass, inertia, mount, yaw = of_drone(parameters, number)
-        own = parts.add_rows(own, parts.diagonal_turned_about_z(yaw, inertia))
-        far = parts.add_rows(far, parts.scale_rows(mass, parts.point_inertia(mount)))
-    carrier = parts.diagonal(_vector(parameters.carrier_inertia))
-    return parts.add_rows(parts.add_rows(own, far), carrier)
+def own_inertia(parameters: PlantParameters) -> Array:
+    """(N, 3, 3) of every drone about its own centre, body axes: Rz I Rz^T, Rz by its yaw [kg m2]."""
+    xp = parameters.yaw.__array_namespace__()
+    c, s, zero = xp.cos(parameters.yaw), xp.sin(parameters.yaw), xp.zeros_like(parameters.yaw)
+    turn = joined([joined([c, -s, zero]), joined([s, c, zero]), joined([zero, zero, zero + 1.0])], axis=-2)
+    return (turn[..., None, :] * parameters.own_inertia[..., None, None, :] * turn[..., None, :, :]).sum(axis=-1)
 
 
-def _vector(array: Array) -> Parts:
-    return parts.entry(array, 0), parts.entry(array, 1), parts.entry(array, 2)
+def point_inertia(place: Array) -> Array:
+    """|r|^2 1 - r r^T (..., 3, 3) of a unit point mass at `place` r (..., 3), without differences of squares."""
+    x, y, z = (place[..., i] for i in range(3))
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, -x * y, -x * z, -y * z
+    return joined([joined([yy + zz, xy, xz]), joined([xy, xx + zz, yz]), joined([xz, yz, xx + yy])], axis=-2)
 
 
-def own_inertia(parameters: PlantParameters, number: int) -> Rows:
-    """Inertia of drone `number` about its own centre, body axes [kg m2]."""
-    _, inertia, _, yaw = of_drone(parameters, number)
-    return parts.diagonal_turned_about_z(yaw, inertia)
-
-
-def shell_and_ball(parameters: PlantParameters) -> tuple[Parts, Parts]:
-    """Inertia per kg of object of its fixed and of its moving part [m2]."""
-    return _vector(parameters.shell_inertia_per_mass), _vector(parameters.ball_inertia_per_mass)
-
-
-def shared(values: Array, like: Array) -> Any:
-    """A float if `values` (..., N) are constants that are all equal, else an array of the type of `like`."""
-    if isinstance(values, np.ndarray) and values.ndim == 1:
-        if (values == values[0]).all():
-            return float(values[0])
-        return like.__array_namespace__().asarray(values, dtype=like.dtype)
-    return values
+def diagonal(values: Array) -> Array:
+    """The matrices (..., 3, 3) with `values` (..., 3) on their diagonals."""
+    return values[..., None] * np.eye(3, dtype=values.dtype)
 
 
 def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:

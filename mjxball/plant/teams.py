@@ -135,9 +135,8 @@ def varied(parameters: PlantParameters, factors: Factors, attitude: Attitude, ob
         carrier_mass=carrier,
         carrier_inertia=parameters.carrier_inertia * factors.carrier_scale,
     )
-    rows = rigid_inertia(found)
     carried = object_mass * found.object_inertia_per_mass
-    inertia = [rows[axis][axis] + carried[axis] for axis in range(3)]
+    inertia = [rigid_inertia(found)[axis, axis] + carried[axis] for axis in range(3)]
     drones = (found.drone_mass > 0).sum()
     gains = design_gains(inertia, attitude.natural_frequency, attitude.damping, drones)
     xp = found.mounts.__array_namespace__()

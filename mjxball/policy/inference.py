@@ -18,7 +18,6 @@ from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.unbatched import SingleFollower
 
 ROUNDED = 1e-5  # that a GRU's state may be beyond 1
 
@@ -70,8 +69,6 @@ class Policy:
         self._geometry: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
         self._thread = OneThread()
-        self._single: SingleFollower | None = None
-        self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
     @property
     def _facts(self) -> dict[str, object]:
@@ -117,14 +114,12 @@ class Policy:
     @property
     def memory(self) -> Array:
         """What it remembers (..., m), see `control.follower_law.FollowerLaw`; None: nothing yet."""
-        if self._ahead and self._single is not None:
-            return self._single.memory
         return self._memory
 
     @memory.setter
     def memory(self, memory: Array) -> None:
         """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers, of a GRU up to 1."""
-        self._memory, self._ahead = None if memory is None else self._checked(memory), False
+        self._memory = None if memory is None else self._checked(memory)
         self._thread.forget()
 
     @property
@@ -134,8 +129,8 @@ class Policy:
         return None if memory is None else self._law.hidden(memory)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which share neither the buffers of `_single` nor the thread."""
-        return {**self.__dict__, "_memory": self.memory, "_single": None, "_ahead": False, "_thread": OneThread()}
+        """For copies, which do not share the thread."""
+        return {**self.__dict__, "_thread": OneThread()}
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
@@ -155,10 +150,6 @@ class Policy:
         remembers = self._law.size > 0
         if remembers:
             self._thread.check(self.name)
-        if observation.ndim == 1 and remembers and len(self._weights) > 1:
-            alone = self._answer_alone(observation)
-            if alone is not None:
-                return alone
         law, memory = self.law, self.memory if remembers else None
         if memory is not None:
             check_batch(self.name, memory.shape[:-1], observation)
@@ -167,23 +158,8 @@ class Policy:
         if not math.isfinite(float(command.sum()) + float(memory.sum())):
             raise InputError(f"policy {self.name} has no answer to an observation: what it computes is not finite")
         if remembers:
-            self._memory, self._ahead = memory, False
+            self._memory = memory
         return action, command
-
-    def _answer_alone(self, observation: Array) -> tuple[Array, Array] | None:
-        """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
-        if self._single is None:
-            self._single = SingleFollower(self._law, self._network)
-        if not self._ahead:
-            memory = self.law.start(observation) if self._memory is None else self._memory
-            if memory.ndim > 1:  # of several followers
-                return None
-            self._single.memory = memory
-        found = self._single.answer(observation)
-        if found is None:
-            return None
-        self._ahead = True
-        return found
 
     def _checked(self, memory: Array) -> Array:
         """A copy of `memory`, or InputError unless it is one that this policy may have."""

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+from mjxball.arrays import clipped, joined
 from mjxball.config import Config
 from mjxball.control import leader, rotations
 from mjxball.control import observation as layout
 from mjxball.plant import PlantParameters
-from mjxball.plant.parts import clipped, joined
 
 if TYPE_CHECKING:
     from jaxtyping import Float

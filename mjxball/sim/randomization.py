@@ -145,9 +145,6 @@ class ResetDistribution:
             ball_offset=(self._direction(rng, 9) if self._in_plane else 1.0) * symmetric(scenario.ball_start, 1)[0],
             parameters=None if rig is None else rig.numbers,
         )
-        if scenario.ball_speed > 0:
-            speed = scenario.ball_speed * jax.random.uniform(jax.random.fold_in(rng, 10), minval=-1.0, maxval=1.0)
-            plant = plant._replace(ball_rate=self._direction(rng, 11) * speed if self._in_plane else speed)
         return load, plant, symmetric(scenario.goal_range), rig
 
     def _of_rig(self, load: Load, rig: Rig, key: Array) -> Load:

@@ -222,8 +222,8 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
         ball_limit=length,
         gravity=None,
     )
-    rows = rigid_inertia(whole(numbers, gravity))
-    about = [rows[axis][axis] + load * ball for axis in range(3)]
+    empty = rigid_inertia(whole(numbers, gravity))
+    about = [empty[:, axis, axis] + load * ball for axis in range(3)]
     # The loop is as fast as it was drawn, up to what the rotors can give for a step of `UNSATURATED_TILT`.
     hover = gravity * (mass * size + carrier + load) / (4 * size)
     room = torque_room(arm, config.plant.layout, hover, strongest)

@@ -20,12 +20,12 @@ from mjxball.xla import traced_directory
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 # One follower's kernels gain nothing from being tuned and optimised further, and it costs a third of the compile time.
-# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/archive.)
+# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run.)
 GPU_OPTIONS: dict[str, Any] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
 # Products of batches of thousands: of cuBLAS's kernels XLA tries a few, of Triton's it first compiles hundreds, which
-# are hardly faster (PPO of `ant`: docs/archive/training.md).
+# are hardly faster (PPO of Brax's `ant`).
 CUBLAS_GPU_OPTIONS: dict[str, Any] = {"xla_gpu_enable_triton_gemm": False, "xla_backend_optimization_level": 1}
-# The small products of many followers at once take half as long when tuned (64 of SAC: docs/archive/training.md).
+# The small products of many followers at once take half as long when tuned (64 of SAC).
 TUNED_GPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 # For algorithms that are done sooner than XLA, which then compiles twice as fast what runs a quarter slower.
 CPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
@@ -96,11 +96,6 @@ class TracedProgram:
         self._structure = jax.tree.structure(result)
         self._path = _path(name, key)
         self._kept = _read(self._path)
-
-    @property
-    def found(self) -> bool:
-        """Whether it need not be traced."""
-        return self._kept is not None
 
     def _traced(self) -> tuple[Any, list[int]]:
         """The exported program and which of the carried arrays it leaves unchanged."""

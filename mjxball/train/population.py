@@ -76,7 +76,6 @@ class Population:
         self._sweep = dict(sweep or {})
         self._single = members == 1 and not self._sweep
         self._template: TrainState | None = None
-        self._ahead: Future[Any] | None = None
         self._values = {name: np.asarray(values, np.float32) for name, values in self._sweep.items()}
         if devices is None:
             devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
@@ -115,14 +114,6 @@ class Population:
             self._template = jax.eval_shape(self._create, self._values, self._keys(0))
         return self._template
 
-    def read_ahead(self) -> None:
-        """Have the longest program loaded meanwhile, if an earlier run left it in the cache of one device."""
-        if self.mesh is None:
-            with jax_setting("jax_traceback_in_locations_limit", 0):
-                if self._collection.found:
-                    options = compiler_options(self.program.algorithm, self.members)
-                    self._ahead = ThreadPoolExecutor(1).submit(self._collection.lower_carrying().compile, options)
-
     def compile(self, creating: bool) -> Compiled:
         """Compile everything a run needs, side by side; `begin` only if `creating`.
 
@@ -139,8 +130,7 @@ class Population:
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
             try:
-                pending = [] if self._ahead is None else [self._ahead]
-                pending += [pool.submit(work.compile, compiler_options=options) for work in lowered]
+                pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
             finally:
                 pool.shutdown(wait=self.mesh is not None)
         collect, update, episodes, *begin = map(_when_ready, pending)
@@ -153,11 +143,11 @@ class Population:
         )
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
-        """collect, update, episodes and, if `creating`, begin on one device; `read_ahead` may have had the first."""
+        """collect, update, episodes and, if `creating`, begin on one device."""
         key, state = self._key, self.template()
         values, keys, phase = jax.tree.map(_shape, (*self._starts(0), warmup(1).phase))
-        if self._ahead is None:
-            yield self._collection.lower_carrying()
+        collect = lambda: (state, jax.tree.map(_shape, self.no_statistics()), phase)  # noqa: E731
+        yield TracedProgram("collect", key, self._collect, collect, others=len(phase)).lower_carrying()
         update = lambda: (state, _shape(self._drawn()))  # noqa: E731
         yield TracedProgram("update", key, self._update, update, others=1).lower_carrying()
         episodes = lambda: (values, keys, phase.random)  # noqa: E731
@@ -165,13 +155,6 @@ class Population:
         if creating:
             begin = lambda: (values, keys)  # noqa: E731
             yield TracedProgram("begin", key, self._begin, begin, state._replace(envs=())).lower()
-
-    @functools.cached_property
-    def _collection(self) -> TracedProgram:
-        def shapes() -> Any:
-            return self.template(), *jax.tree.map(_shape, (self.no_statistics(), warmup(1).phase))
-
-        return TracedProgram("collect", self._key, self._collect, shapes, others=len(warmup(1).phase))
 
     @functools.cached_property
     def _key(self) -> dict[str, Any] | None:

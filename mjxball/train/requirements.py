@@ -1,4 +1,4 @@
-"""What a training takes at the least, from its settings alone; what cannot fit or end is refused before it compiles.
+"""What a training takes at the least, from its settings alone; what cannot fit is refused before it compiles.
 
 Lower bounds: nothing that would work is refused. What they leave out (temporary arrays, other programs) is noticed
 later, see `mjxball.xla.explained`.
@@ -23,10 +23,6 @@ STATE = 100  # numbers of an environment: two drones, a load, what the follower 
 ROW = 2 * OBSERVATION_SIZE + ACTION_SIZE + 3  # numbers of a recorded step
 COPIES = 2  # of the whole state: it trains on while a checkpoint of it is written
 PROGRAM = 0.5e9  # [B] of compiling and running the smallest training, beyond what imports have taken
-PHYSICS_STEP = 1e3  # operations of one physics step of one environment
-FASTEST = 1e14  # [1/s] operations of any device
-ONE_AFTER_ANOTHER = 1e-7  # [s] of steps that need each other's results, at the least
-YEAR = 365 * 86_400.0  # [s]
 MOST_STEPS = 2**31 - 1  # environment steps are counted in 32 bits
 
 
@@ -34,18 +30,14 @@ class Required(NamedTuple):
     """At the least, for all members."""
 
     memory: float  # [B] on all devices together
-    seconds: float
     steps: int  # environment steps of each member
 
 
 def required(config: Config, algorithm: str, members: int) -> Required:
     """What `members` followers take, trained by `sac`, `ppo` or `gradient`."""
     of = {"sac": _sac, "ppo": _ppo, "gradient": _gradient}[algorithm]
-    steps, rounds, state, data, operations = of(config)
-    physics = config.timing.physics_steps
-    memory = NUMBER * members * (COPIES * state + data)
-    operations += steps * physics * PHYSICS_STEP
-    return Required(memory, max(members * operations / FASTEST, rounds * physics * ONE_AFTER_ANOTHER), steps)
+    steps, state, data = of(config)
+    return Required(NUMBER * members * (COPIES * state + data), steps)
 
 
 def _weights(inputs: int, layers: Sequence[int], outputs: int) -> int:
@@ -59,8 +51,8 @@ def _policy(config: Config, layers: Sequence[int]) -> int:
     return gru + _weights(OBSERVATION_SIZE + units, layers, outputs) + units * outputs
 
 
-# Each: environment steps, rounds of steps that follow each other, numbers of the state, of other arrays, operations.
-_Sizes = tuple[int, int, float, float, float]
+# Each: environment steps, numbers of the state, of other arrays.
+_Sizes = tuple[int, float, float]
 
 
 def _sac(config: Config) -> _Sizes:
@@ -69,47 +61,31 @@ def _sac(config: Config) -> _Sizes:
     critics = sac.num_critics * _weights(OBSERVATION_SIZE + ACTION_SIZE, sac.critic_layers, 1)
     row = ROW + 2 * config.follower.recurrent_units
     state = 4 * policy + 4 * critics + (sac.replay_size + sac.num_envs) * row + sac.num_envs * STATE
-    rounds = max(sac.total_steps // sac.num_envs, 1)
-    updates = max(sac.total_steps - sac.warmup_steps, 0) // sac.num_envs * sac.updates_per_step
-    operations = 6.0 * updates * sac.batch_size * (policy + critics)
-    return sac.total_steps, rounds + updates, state, sac.updates_per_step * sac.batch_size * row, operations
+    return sac.total_steps, state, sac.updates_per_step * sac.batch_size * row
 
 
 def _ppo(config: Config) -> _Sizes:
-    from mjxball.algorithms.ppo import EPOCHS, VALUE_LAYERS  # with Brax
+    from mjxball.algorithms.ppo import VALUE_LAYERS  # with Brax
 
     ppo = config.ppo
     policy, value = _policy(config, ppo.policy_layers), _policy(config, VALUE_LAYERS)
     data = ppo.num_envs * ppo.unroll_length * (ROW + 2 * config.follower.recurrent_units)
-    rounds = max(ppo.total_steps // ppo.num_envs, 1)
-    return (
-        ppo.total_steps,
-        rounds,
-        3 * (policy + value) + ppo.num_envs * STATE,
-        data,
-        6.0 * ppo.total_steps * EPOCHS * (policy + value),
-    )
+    return ppo.total_steps, 3 * (policy + value) + ppo.num_envs * STATE, data
 
 
 def _gradient(config: Config) -> _Sizes:
     gradient = config.gradient
     policy = _policy(config, gradient.policy_layers)
     kept = sum(gradient.policy_layers) + 4 * config.follower.recurrent_units + STATE  # of every step, for the way back
-    rounds = gradient.gradient_steps * gradient.horizon
-    steps = rounds * gradient.num_envs
-    data = gradient.num_envs * gradient.horizon * kept
-    return steps, rounds, 3 * policy + gradient.num_envs * STATE, data, 6.0 * steps * policy
+    data = gradient.num_envs * gradient.horizon
+    return gradient.gradient_steps * data, 3 * policy + gradient.num_envs * STATE, data * kept
 
 
 def check(config: Config, algorithm: str, members: int) -> None:
-    """Refuse by InputError, with the numbers, what this computer's memory, 32 bits or a year do not hold."""
+    """Refuse by InputError, with the numbers, what this computer's memory or 32 bits do not hold."""
     needs = required(config, algorithm, members)
     if needs.steps > MOST_STEPS:
         raise InputError(f"the run has {needs.steps:.3g} environment steps, and {MOST_STEPS:.3g} can be counted")
-    if needs.seconds > YEAR:
-        raise InputError(
-            f"the run would take at least {needs.seconds / YEAR:.3g} years on the fastest device; make it smaller"
-        )
     room, where = room_for_arrays()
     if needs.memory > room:
         raise InputError(

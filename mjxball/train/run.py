@@ -113,7 +113,6 @@ class Run:
         self._policies = [start_policy(start, config) for start in self._starts] if resumed is None else []
         extensions = resolve(Extensions(**(origin.get("extensions") or {})))
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"], extensions=extensions)
-        self.population.read_ahead()
         self._schedule = self.population.program.schedule
         kind = jax.devices()[0].device_kind
         hardware = f"{os.cpu_count()} CPU cores" if kind == "cpu" else f"{self.population.devices} x {kind}"

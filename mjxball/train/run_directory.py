@@ -28,7 +28,6 @@ from mjxball.reading import parse_json
 from mjxball.terminal import warn
 
 LONGEST_COUNT = 20  # digits of a number of steps
-SINCE = {"recurrent_units": 0}  # settings of followers that older policies do not name, and what these have
 
 
 def read_json(path: Path, called: str) -> Any:
@@ -109,8 +108,8 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     if file_hash(path) != start["sha256"]:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
     own = parse_json(json.dumps(configs.to_dict(config)["follower"]))
-    trained = configs.with_current_names(contents.card.get("config", {})).get("follower", {})
-    changed = [f"follower.{name}" for name in own if own[name] != trained.get(name, SINCE.get(name))]
+    trained = contents.card.get("config", {}).get("follower", {})
+    changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
     return contents
@@ -252,18 +251,15 @@ def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float
 
 
 def check_sweep(sweep: Any, members: int, config: Config, where: str) -> dict[str, list[float]]:
-    """`sweep` under the settings' present names; InputError that begins with `where` unless it fits the members."""
+    """`sweep` itself; InputError that begins with `where` unless it fits the members."""
     if not isinstance(sweep, dict) or not sweep:
         raise InputError(f"{where} must hold an object of settings")
-    for given, values in sweep.items():
-        name = configs.current_name(given)
-        if given in configs.CONSTANT:
-            raise InputError(f"{where}: {given} is no setting any more: it is {configs.CONSTANT[given]!r}")
+    for name, values in sweep.items():
         if name not in SWEEPABLE:
-            raise InputError(f"{where}: {given!r} cannot differ between members; {', '.join(SWEEPABLE)} can")
+            raise InputError(f"{where}: {name!r} cannot differ between members; {', '.join(SWEEPABLE)} can")
         if not isinstance(values, list) or len(values) != members:
             raise InputError(f"{where}: {name} needs {members} numbers, one for each seed")
         for value in values:
             whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53
             configs.validate(configs.replace(config, name, float(value) if whole else value))
-    return {configs.current_name(name): values for name, values in sweep.items()}
+    return sweep

@@ -342,7 +342,7 @@ def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:
         (["--gradient.horizon", "10"], "--algorithm gradient"),
         (["--algorithm", "td3"], "sac, ppo, gradient, package.module:Name"),
         (["--algorithm", "ppo", "--ppo.minibatches", "7"], "ppo.minibatches"),
-        (["--algorithm", "ppo", "--ppo.activation", "swish"], "ppo.activation is no setting any more"),
+        (["--algorithm", "ppo", "--ppo.activation", "swish"], "unrecognized arguments: --ppo.activation"),
         (["--start-from", TRANSPORT], "--start-from needs --algorithm gradient"),
         (["--algorithm", "gradient", "--start-from", "none.npz"], "none.npz"),
         (["paper", "--algorithm", "gradient", "--start-from", shipped_policy("universal")], "follower."),

@@ -13,6 +13,7 @@ import pytest
 from scipy.optimize import minimize
 from tables import rows
 
+from batch import Batch
 from mjxball import config as configs
 from mjxball.baselines import make_baseline, make_law
 from mjxball.baselines.lqg_design import TILT
@@ -43,7 +44,6 @@ from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import mount_angles
 from mjxball.control.rotations import turned_about_z
 from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import measure_batch
 from mjxball.plant.teams import ring_config
 from mjxball.sim.disturbances import Disturbance

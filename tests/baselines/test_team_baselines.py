@@ -10,12 +10,12 @@ import pytest
 from plants import team
 from tables import rows
 
+from batch import Batch
 from mjxball.baselines import make_baseline, make_law
 from mjxball.baselines.assembly_model import assembly_model
 from mjxball.config import Attitude, Config, apply_overrides, preset, replace, with_plant
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics, measure_batch
 from mjxball.physics.engine import total_wrench
 from mjxball.plant import plant_parameters

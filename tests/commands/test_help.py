@@ -46,7 +46,6 @@ def test_help_fits_three_screens_and_all_has_everything(helped: Helped) -> None:
     assert {f"--{path}" for path in COMMON} | {"--seed", "--out", "--resume", "--plant"} <= flags(common)
     assert flags(common) < flags(every)
     assert {f"--{path}" for path, _, _ in config.leaves(config.Config())} <= flags(every)
-    assert not flags(every) & {f"--{old}" for old in (*config.RENAMED, *config.CONSTANT)}
     assert common.index("--seed") < common.index("--env") < common.index("--distributed") < common.index("--sac.")
 
 

@@ -226,7 +226,7 @@ BAD_ARGUMENTS = {
     "resume with a setting": ["--resume", "full", "--sac.total_steps", 5],
     "resume with an output": ["--resume", "full", "--out", "new"],
     "negative mass": ["--plant.object_mass", -1],
-    "negative drone mass": ["--plant.leader_mass", -1],
+    "negative drone mass": ["--plant.drones.0.mass", -1],
     "mass is not a number": ["--plant.object_mass", "nan"],
     "mass range with a negative end": ["--scenario.object_mass=-0.1,0.2"],
     "range of one number": ["--scenario.object_mass", 0.2],
@@ -315,13 +315,6 @@ BAD_EXPORTS = {
 def test_bad_export_is_refused(here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     (here / "old.npz").write_bytes(b"old")
     assert_refused(export.main, arguments, here, capsys)
-
-
-def test_a_setting_that_is_a_constant_now_may_say_so(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = ["--follower.base", "pd", "--follower.differential_thrust_share", "0"]
-    assert cli.apply_config_flags(configs.preset("balance"), parser().parse_args(asked)) == configs.preset("balance")
-    said = assert_refused(main, ["balance", "--follower.base", "lqg"], here, capsys)
-    assert "follower.base is no setting any more: it is 'pd', and cannot be 'lqg'" in said
 
 
 def test_a_list_may_begin_with_a_negative_number() -> None:

@@ -85,7 +85,7 @@ def test_a_drone_has_the_mass_and_inertia_that_mujoco_computes(places: tuple, tm
     about_centre = matrix[3:, 3:] - mass * np.diag([height**2, height**2, 0.0])
     for number, drone in enumerate(plant.drones):
         assert drone.mass == pytest.approx(mass, rel=1e-12)
-        own = own_inertia(plant_parameters(plant, Attitude()), number)
+        own = own_inertia(plant_parameters(plant, Attitude()))[number]
         np.testing.assert_allclose(own, about_centre, rtol=1e-9, atol=1e-12)
     assert height > 0.01
     assert (plant.arm, plant.rotor_force_max, plant.yaw_per_thrust) == pytest.approx((0.15, 7.0, 0.02))

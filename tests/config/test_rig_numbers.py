@@ -59,8 +59,8 @@ def test_draws_keep_their_proportion_to_the_object_unless_the_file_says_otherwis
     assert small.scenario.object_mass == (0.1, 0.3)
     said = with_plant(preset("transport"), written(tmp_path, HEAVY + "[scenario]\nobject_mass = [0.3, 0.4]\n"))
     assert said.scenario.object_mass == (0.3, 0.4)
-    robust = with_plant(preset("robust"), written(tmp_path, HEAVY)).scenario
-    assert robust.mass_change == pytest.approx((-0.0875, 0.105))
+    changing = configs.replace(preset("transport"), "scenario.mass_change", (-0.05, 0.06))
+    assert with_plant(changing, written(tmp_path, HEAVY)).scenario.mass_change == pytest.approx((-0.0875, 0.105))
     drawn = TransportEnv(rig, "newton-euler").reset(jax.random.key(0)).pipeline_state.load.object_mass
     assert 0.175 <= float(drawn) <= 0.525
 

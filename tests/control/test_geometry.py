@@ -11,7 +11,7 @@ import pytest
 from tables import rows
 
 from mjxball import config as configs
-from mjxball.algorithms.base import RecurrentNetwork
+from mjxball.algorithms.base import PolicyNetwork
 from mjxball.config import Config, preset
 from mjxball.control.geometry import GEOMETRY, team_geometry
 from mjxball.env import TransportEnv
@@ -71,7 +71,7 @@ def silent(config: Config) -> PolicyFile:
     layers = {name: {"kernel": np.zeros(shape), "bias": np.zeros(shape[1])} for name, shape in shapes.items()}
     gates = 3 * units
     gru = {"kernel": np.zeros((size, gates)), "recurrent": np.zeros((units, gates)), "bias": np.zeros(gates)}
-    learnt = RecurrentNetwork({**layers, "gru": gru}, np.zeros(size), np.ones(size), np.ones(size))
+    learnt = PolicyNetwork({**layers, "gru": gru}, np.zeros(size), np.ones(size), np.ones(size))
     return policy_file(config, law, learnt, steps=0)
 
 

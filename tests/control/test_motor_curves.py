@@ -155,7 +155,7 @@ class TestDrawnWorlds:
 
     @pytest.mark.slow
     def test_other_presets_draw_no_battery(self) -> None:
-        env = TransportEnv(preset("robust"), "newton-euler")
+        env = TransportEnv(preset("balance"), "newton-euler")
         load = env.reset(jax.random.PRNGKey(0)).pipeline_state.load
         assert load.battery is None
         assert load.uncompensated is None

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from batch import Batch
 from mjxball.baselines import LAWS, make_baseline
 from mjxball.config import preset
 from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.results import fly_scenarios
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy

@@ -14,11 +14,11 @@ import pytest
 from command_line import REPOSITORY, call
 from tables import rows
 
+from batch import Batch
 from mjxball.baselines import make_baseline
 from mjxball.cli import plant_setup
 from mjxball.commands import evaluate
 from mjxball.config import preset
-from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.policies import beyond_card, load_policy
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file, save_file, shipped_policies, shipped_policy

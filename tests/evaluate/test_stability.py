@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import stability
+from batch import law_of
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
-from mjxball.evaluate.batch import law_of
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario

@@ -76,7 +76,6 @@ def stuck(world: VirtualTwin, number: int) -> None:
 def broken_policy(world: VirtualTwin, number: int) -> None:
     world.flight.controller.policy.reset()
     world.flight.controller.policy._biases[-1][:] = math.nan
-    world.flight.controller.policy._single = None  # a copy
 
 
 def interrupt(world: VirtualTwin, number: int) -> None:

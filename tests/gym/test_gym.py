@@ -21,7 +21,7 @@ from gymnasium.utils.seeding import np_random
 
 import mjxball.gym
 from mjxball.baselines import make_baseline
-from mjxball.config import PRESETS, Config, preset
+from mjxball.config import PRESETS, Config, preset, replace
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.results import fly_scenarios
@@ -53,7 +53,7 @@ def actions(steps: int, *shape: int) -> np.ndarray:
 def test_every_preset_of_a_pair_is_registered():
     ours = {name for name in gymnasium.registry if name.startswith("mjxball/")}
     assert ours == {mjxball.gym.environment_id(name) for name, config in PRESETS.items() if config.plant.count == 2}
-    assert {"mjxball/Transport-v0", "mjxball/Paper-v0", "mjxball/Robust-v0"} <= ours
+    assert {"mjxball/Transport-v0", "mjxball/Paper-v0", "mjxball/Balance-v0"} <= ours
 
 
 @pytest.mark.parametrize(
@@ -77,14 +77,14 @@ def test_gymnasiums_checker_finds_nothing(name: str):
     assert [text for text in odd if "infinity" not in text] == []
 
 
-@pytest.mark.parametrize("name", ["transport", pytest.param("robust", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["transport", pytest.param("balance", marks=pytest.mark.slow)])
 def test_it_flies_as_the_brax_environment(name: str, request: pytest.FixtureRequest):
     """Float64 against the training environment in float32, from the same drawn world, 50 steps.
 
-    C MuJoCo (`robust`: the closed form) against closed-form physics, which compiles fastest; tests/test_env.py holds
+    C MuJoCo (`balance`: the closed form) against closed-form physics, which compiles fastest; tests/test_env.py holds
     MJX against it.
     """
-    config = preset(name)
+    config = replace(preset(name), "follower.recurrent_units", 0)  # as Gymnasium has it
     env = FollowerEnv(config=config)
     first, _ = env.reset(seed=7)
     _, key = jax.random.split(jax.random.key(core.seed_number(np_random(7)[0])))
@@ -216,7 +216,7 @@ def test_mistakes_are_named():
     with pytest.raises(InputError, match="unknown physics 'ode'"):
         FollowerEnv(physics="ode")
     with pytest.raises(InputError, match="C MuJoCo has no inertia without mass"):
-        FollowerEnv("robust", physics="mujoco")
+        FollowerEnv("balance", physics="mujoco")
     with pytest.raises(ValueError, match="render_mode must be"):
         FollowerEnv(render_mode="human")
     vector = FollowerVectorEnv(2, physics="newton-euler")

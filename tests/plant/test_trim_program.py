@@ -12,13 +12,13 @@ import pytest
 from plants import team
 from tables import rows
 
+from batch import Batch
 from mjxball.baselines import make_baseline
 from mjxball.config import Attitude, Config, Drone, Plant, preset, replace, with_plant
 from mjxball.control.attitude import rotor_commands
 from mjxball.control.constants import trim_limit
 from mjxball.control.mixer import torque_per_force
 from mjxball.errors import InputError
-from mjxball.evaluate.batch import Batch
 from mjxball.physics.engine import total_wrench
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import Trim, largest_amplitude, largest_margin, safe_radius

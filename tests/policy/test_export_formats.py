@@ -207,7 +207,6 @@ def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_pat
     policy = Policy(balanced(contents), "follower")
     network = policy._network
     gru = None if network.gru is None else (*map(Whole, network.gru[:2]), network.gru[2])
-    policy._answer_alone = lambda observation: None
     policy._network = network._replace(weights=[Whole(weight) for weight in network.weights], gru=gru)
     flight, exact = flown(contents, np.float32, policy), flown(contents, np.float32)
     answer, _ = answered(compiled(contents, tmp_path, "float", int8=True), flight, np.float32)

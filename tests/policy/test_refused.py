@@ -307,10 +307,13 @@ class TestDamagedCard:
         rewrite_card(saved, lambda card: card.update({field: value}))
         refused(saved)
 
-    def test_residual_policy_of_unknown_plant_still_loads(self, saved):
-        """The plant is told to the reader, not used: an unknown field of it is no damage."""
-        rewrite_card(saved, lambda card: card["plant"].update(colour="red"))
-        assert Policy.load(saved).card["plant"]["colour"] == "red"
+    def test_residual_policy_of_unknown_plant_still_loads(self, saved, capsys):
+        """The network does not use the plant, so that settings of another version are no damage; evaluation does."""
+        rewrite_card(saved, lambda card: card["plant"].update(leader_mass=1.0))
+        assert Policy.load(saved).card["plant"]["leader_mass"] == 1.0
+        said = assert_refused(evaluate.main, [saved], saved.parent, capsys)
+        assert f"{saved}: configuration" in said
+        assert "unknown leader_mass; mjxball 0.1.0 is the last version that reads" in said
 
 
 def loads_or_is_refused(path: Path) -> None:

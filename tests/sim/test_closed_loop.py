@@ -85,7 +85,7 @@ class TestSharedIntegrals:
         assert not alone[3:].any()
 
     def test_presets_of_the_1_kg_plant_keep_three_integrals_and_their_commands(self) -> None:
-        for name in ("transport", "robust", "paper"):
+        for name in ("transport", "balance", "paper"):
             loop, integral = started(PRESETS[name])
             assert integral.shape == (3,)
             command = np.array([0.1, 0.2, 0.3])

@@ -196,7 +196,9 @@ def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> 
 
 
 def test_no_world_is_drawn_whose_thrust_nobody_could_trim() -> None:
-    config = preset("robust")
+    load = {"object_mass": (0.1, 0.32), "mass_change": (-0.05, 0.06), "cg_amplitude": (0.0, 0.17)}
+    varied = {**load, "mass_known": False, "thrust_scale": (0.8, 1.2)}
+    config = with_settings(preset("transport"), scenario=varied)
     env = TransportEnv(config, "newton-euler")
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 2000)).pipeline_state.load
     assert float(jax.vmap(env._resets.trimmed)(load).min()) > -1e-3

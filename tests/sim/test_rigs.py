@@ -19,7 +19,6 @@ from mjxball.control.followers import PrivilegedInfo
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.random_rigs import AnyRigLaw, Flown, fly, rig_laws, stacked
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
@@ -40,6 +39,7 @@ from mjxball.sim.rigs import (
 )
 from mjxball.sim.rollout import load_of, simulate, start_of
 from mjxball.sim.scenario import Scenario
+from random_rigs import AnyRigLaw, Flown, fly, rig_laws, stacked
 
 UNIVERSAL = preset("universal")
 POLICY = shipped_policy("universal")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,14 +41,6 @@ def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     yield child
     child.kill()
     child.communicate()
-
-
-def written(place: Path, renewed: float, **holder: object) -> None:
-    """A lock file as a process of another machine left or keeps it, `renewed` seconds ago."""
-    place.mkdir()
-    (place / lock.LOCK).write_text(json.dumps({"host": "far", "pid": 7, "since": "today", "boot": "other", **holder}))
-    then = time.time() - renewed
-    os.utime(place / lock.LOCK, (then, then))
 
 
 def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
@@ -94,47 +84,11 @@ def test_directories_that_nothing_was_written_to_are_removed(tmp_path: Path) -> 
     assert [path.name for path in (tmp_path / "new" / "run").iterdir()] == ["kept"]
 
 
-def test_between_machines_without_common_locks_the_age_counts(tmp_path: Path) -> None:
-    written(tmp_path / "living", renewed=lock.RENEWED)
-    living = "process 7 on far, since today; if that has ended, wait"
-    with pytest.raises(InputError, match=living), lock.held(tmp_path / "living"):
-        pass
-    written(tmp_path / "left", renewed=lock.STALE + 1)
-    with lock.held(tmp_path / "left"):
-        assert json.loads((tmp_path / "left" / lock.LOCK).read_text())["pid"] == os.getpid()
-    written(tmp_path / "restarted", renewed=lock.RENEWED, boot=lock._boot())  # this machine's lock would still be held
-    with lock.held(tmp_path / "restarted"):
-        pass
-
-
-def test_the_holder_renews_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "RENEWED", 0.01)
-    with lock.held(tmp_path):
-        os.utime(tmp_path / lock.LOCK, (0, 0))
-        deadline = time.monotonic() + 20
-        while (tmp_path / lock.LOCK).stat().st_mtime < 1 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert (tmp_path / lock.LOCK).stat().st_mtime > time.time() - 60
-
-
-def test_a_file_system_without_locks_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with lock.held(tmp_path / "run"):
-        assert "has no locks" in capsys.readouterr().err
-        with pytest.raises(InputError, match=f"process {os.getpid()}"), lock.held(tmp_path / "run"):
-            pass
-
-
 def test_a_directory_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> int:
+    def refuse(*_: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr(lock, "_acquire", refuse)
+    monkeypatch.setattr(lock, "_acquired", refuse)
     with pytest.raises(InputError, match="cannot be written: Read-only"), lock.held(tmp_path):
         pass
 

@@ -1,4 +1,4 @@
-"""What cannot fit or end is refused before it compiles, with the numbers; every preset is let through."""
+"""What cannot fit is refused before it compiles, with the numbers; every preset is let through."""
 
 from __future__ import annotations
 
@@ -36,7 +36,6 @@ TOO_MUCH: list[tuple[list[Any], str]] = [
     (["--follower.recurrent_units", 512, "--num-seeds", 1024], "GB are free"),
     (["--num-seeds", 4096], "GB are free"),
     (["--sac.total_steps", 10**12], "environment steps"),
-    (["--sac.total_steps", 2 * 10**9, "--sac.num_envs", 1, "--sac.updates_per_step", 10**5], "years|days"),
     (["--timing.control_period", "1e-30"], "control_period"),
     (["--timing.physics_steps", 10**9], "physics_steps"),
 ]
@@ -58,7 +57,6 @@ def test_every_preset_fits_a_large_computer() -> None:
         for algorithm in ("sac", "ppo", "gradient"):
             needs = required(settings, algorithm, 1)
             assert needs.memory < 16e9, (name, algorithm)
-            assert needs.seconds < 86_400, (name, algorithm)
             assert needs.steps < requirements.MOST_STEPS, (name, algorithm)
 
 

@@ -120,8 +120,6 @@ _add_operators()
 class Namespace:
     """The part of the array namespace that a policy's laws use."""
 
-    sin, cos = staticmethod(np.sin), staticmethod(np.cos)  # of the desired yaw, a constant
-
     @staticmethod
     def tanh(value: TracedArray) -> TracedArray:
         """Elementwise."""

@@ -15,7 +15,7 @@ from jax.extend import core
 
 Value = Any  # an array, or `Parts`
 Parts = Any  # object array with a tracer or a NumPy scalar for each number
-LARGEST = 128  # numbers; operations on larger arrays stay as they are
+LARGEST = 12  # numbers; operations on larger arrays stay as they are: apart they compile longer and run no sooner
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 ELEMENTWISE = frozenset(
     (
@@ -128,7 +128,8 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     alike = all(_spreads(aval.shape, shape) for aval in avals)  # a change of type may turn one number into several
     rewritten = (name in ELEMENTWISE and alike) or name in REDUCTIONS or name in REARRANGED
     keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
-    if keys or not rewritten or max(aval.size for aval in avals) > LARGEST:
+    sizes = [aval.size for aval in avals]
+    if keys or not rewritten or max(sizes) > LARGEST or min(sizes) == 0:
         return _as_it_is(equation, inputs)
     parts = [_parts(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
     if name in REARRANGED:
@@ -249,7 +250,7 @@ def _array(value: Value, aval: Any) -> Any:
     if not (isinstance(value, np.ndarray) and value.dtype == object):
         return value
     if all(map(_is_constant, value.flat)):
-        return np.array(value.tolist(), aval.dtype)
+        return np.array(value.tolist(), aval.dtype).reshape(aval.shape)
     batch = _batch(value.flat)
     if not aval.shape:
         return jnp.asarray(value[()], aval.dtype)
