@@ -111,6 +111,10 @@ class TransportEnv:
         if config.follower.privileged_critic:
             self._privileged_size = jax.eval_shape(self._first_privileged, jax.random.key(0)).shape[-1]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled by its arguments: what it traces and compiles is made again where it arrives."""
+        return type(self), (self.config, self._backend)
+
     @property
     def observation_size(self) -> int:
         """Length of the networks' input."""

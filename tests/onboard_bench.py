@@ -22,8 +22,13 @@ from mjxfly.app.host import App, Library, State, compile_pair
 from mjxfly.app.protocol import CAUSES, Phase
 from mjxfly.telemetry import ObjectState, Rig
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc is installed")
+NO_GCC = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc is installed")
 AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3))
+
+
+def needs_gcc(test: Any) -> Any:
+    """What compiles belongs to the second tier."""
+    return pytest.mark.slow(NO_GCC(test))
 
 
 def policy_of(name: str) -> PolicyFile:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import pytest
 from command_line import REPOSITORY
 
 NUMBER = r"(-?\d+(?: \d{3})*(?:\.\d+)?)"
@@ -39,6 +40,11 @@ def rows(names: str | tuple[str, ...], table: Iterable[Any]) -> Callable[[Callab
         return loop
 
     return decorate
+
+
+def weekly(*cases: Any) -> list[Any]:
+    """Cases of `parametrize` that repeat others: every week and before a release."""
+    return [pytest.param(case, marks=pytest.mark.release) for case in cases]
 
 
 def says(page: str, phrase: str, numbers: Sequence[float]) -> None:

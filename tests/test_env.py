@@ -104,7 +104,7 @@ def test_same_key_same_world(fast_pair: CompiledEnv):
 
 def test_unknown_mass_is_not_believed(transport):
     env = TransportEnv(with_settings(transport, scenario={"mass_known": False}), "newton-euler")
-    load = env.reset(jax.random.key(5)).pipeline_state.load
+    load = jax.jit(env.reset)(jax.random.key(5)).pipeline_state.load
     assert float(load.believed_mass) == pytest.approx(transport.plant.object_mass, rel=1e-7)  # float32
     assert float(load.object_mass) != float(load.believed_mass)
 

@@ -147,6 +147,7 @@ def test_a_full_disk_keeps_the_old_file_and_names_it(tmp_path: Path, monkeypatch
     assert [one.name for one in tmp_path.iterdir()] == ["kept"]
 
 
+@pytest.mark.slow
 def test_a_command_names_the_file_that_does_not_fit(tmp_path: Path) -> None:
     """The process may write a few kB to a file, as on a disk that has no more."""
     exported = ["-m", "mjxball.export", REPOSITORY / "policies" / "balance.npz", tmp_path / "out.h"]

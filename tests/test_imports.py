@@ -247,6 +247,7 @@ COMMANDS = {OURS: ("commands.train", "commands.evaluate", "view.main", "export")
 COMMANDS[FLIES] = ("main", "view.main", "log", "app.main")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [f"{house}.{name}" for house, names in COMMANDS.items() for name in names])
 def test_a_command_line_is_read_without_what_computes(name: str) -> None:
     """Help and refusals come at once: JAX alone takes half a second."""

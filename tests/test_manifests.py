@@ -20,6 +20,7 @@ def manifests() -> list[Any]:
     return [yaml.safe_load(text) for text in re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)]
 
 
+@pytest.mark.slow
 def test_the_job_set_numbers_its_pods_as_its_command_says(tmp_path: Path) -> None:
     job_set, _ = manifests()
     (job,) = job_set["spec"]["replicatedJobs"]

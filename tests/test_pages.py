@@ -11,10 +11,10 @@ import numpy as np
 from command_line import REPOSITORY
 from tables import rows, says
 
+from mjxball import config as configs
 from mjxball import xla
 from mjxball.cli import plant_setup
-from mjxball.config import Autopilot, _model_source, apply_overrides, preset, thrust_over_weight, total_mass
-from mjxball.config._validate import MOST_DRONES, THRUST_MARGIN
+from mjxball.config import Autopilot, apply_overrides, preset, thrust_over_weight, total_mass
 from mjxball.control import crazyflie, follower_law, motors
 from mjxball.control.axes import axes
 from mjxball.control.constants import hover
@@ -96,8 +96,8 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
         ("mass is believed to be # kg", CELLS["BELIEVED"]),
     ),
     "docs/howto/own-model": (
-        ("of a single one: # to # … more than # elements", 2, MOST_DRONES, _model_source.MAX_ELEMENTS),
-        ("textures of more than # × # points", *2 * (math.sqrt(_model_source.MAX_PIXELS),)),
+        ("of a single one: # to # … more than # elements", 2, configs.MOST_DRONES, configs.MAX_ELEMENTS),
+        ("textures of more than # × # points", *2 * (math.sqrt(configs.MAX_PIXELS),)),
     ),
     "docs/crazyflie": (
         ("deck: # g; thrust upgrade # g; brushless with guards # g", *GRAMS),
@@ -110,7 +110,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
         ("Stick: # m … # g with mounts, ball # g", RIG.object_size[1], 1e3 * RIG.object_mass - BALL, BALL),
         ("stops at ±# mm … weighs # g", 1e3 * RIG.ball_stop, 1e3 * total_mass(RIG)),
         ("hovers at # of at most # … at # on", hover(PAIR)[0], crazyflie.THRUST_CEILING, hover(OLDER)[0]),
-        ("less than # % of … rate loops at # Hz", 100 * THRUST_MARGIN, 1 / crazyflie.PERIOD),
+        ("less than # % of … rate loops at # Hz", 100 * configs.THRUST_MARGIN, 1 / crazyflie.PERIOD),
         ("in roll by # and in yaw by #", axes(PAIR)[0].inertia_ratio, axes(PAIR)[2].inertia_ratio),
         ("margin of # degrees and a gain margin of # either", NEED.phase, NEED.gain),
         ("(# degrees and # for lags of # to", NEED.worst_phase, NEED.worst_gain, 1e3 * NEED.lags[0]),

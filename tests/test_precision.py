@@ -67,7 +67,7 @@ def test_the_default_environment_does_not_round_its_products() -> None:
     check_environment("transport", "mjx", gradient=True)
 
 
-@pytest.mark.slow  # three more traces
+@pytest.mark.release  # three more traces
 @rows("preset, physics", [("stand", "mjx"), ("universal", "newton-euler"), ("team", "mjx")])
 def test_other_environments_do_not_round_their_products(preset: str, physics: str) -> None:
     check_environment(preset, physics, gradient=False)
@@ -111,23 +111,22 @@ def test_baselines_do_not_round_their_products() -> None:
 @pytest.mark.slow  # JaxMARL takes 4 s to import, Brax two
 def test_adapters_do_not_round_their_products() -> None:
     import brax_trainers
-    from mjxball.gym import parallel, playground, single, vector
+    from mjxball.gym import core, playground
 
     config = configs.replace(configs.preset("transport"), "follower.recurrent_units", 0)
     chains, action = jax.random.split(KEY, 2), jnp.zeros((2, 3))
     found = {}
     for physics in TRAINING_ENGINES:
-        program = vector.compiled_program(config, physics)
+        program = core.program(config, physics, many=True)
         state = jax.eval_shape(program.start, chains)[1]
         found["vector", physics] = rounded(program.next_step, chains, state, action)
         found["same step", physics] = rounded(program.same_step, chains, state, action)
         env = playground.PlaygroundEnv(config=config, physics=physics)
         found["playground", physics] = rounded(env.step, jax.eval_shape(env.reset, KEY), action[0])
-        both = parallel.compiled_program(config, physics)
-        found["parallel", physics] = rounded(both.step, jax.eval_shape(both.start, KEY)[1], action[0])
-    laws = single.compiled_laws(config)
-    state = jax.eval_shape(laws.start, KEY)[1]
-    found["single", ""] = rounded(laws.arrive, state, action[0], state.pipeline_state.plant)
+        program = core.program(config, physics)
+        alone = jax.eval_shape(program.start, KEY)[1]
+        found["parallel", physics] = rounded(program.step, alone, action[0])
+    found["single", ""] = rounded(program.arrive, alone, action[0], alone.pipeline_state.plant)
     brax_trainers.brax_trainer("ppo")
     from brax.envs import training
 

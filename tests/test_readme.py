@@ -138,6 +138,7 @@ def test_the_table_is_read() -> None:
     assert {extra for _, _, extra in ROWS} >= {"none", "train", "fly", "gym", "onnx"}
 
 
+@pytest.mark.slow
 def test_the_snippet_prints_what_stands_below_it() -> None:
     snippet = re.search(r"```python\n(.*?)```", README, re.DOTALL)[1]
     done = subprocess.run([sys.executable, "-c", snippet], cwd=REPOSITORY, capture_output=True, text=True, check=True)

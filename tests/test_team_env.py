@@ -68,6 +68,7 @@ class TestRings:
             elif name != "ball_stop":
                 assert found == pytest.approx(value, rel=1e-4, abs=1e-6), name
 
+    @pytest.mark.slow
     def test_a_padded_rig_moves_as_the_rig_itself(self) -> None:
         """The same commands to three drones, alone and with three that pad: the same accelerations."""
         config = settings(scenario__team_sizes=SIZES, scenario__cg_amplitude=(0.1, 0.1), scenario__start_tilt=0.3)
@@ -167,9 +168,10 @@ class TestWorlds:
         assert (np.asarray(plant.rotor_force).any(axis=2).sum(axis=1) == flies).all()
         radius = np.asarray(rig.numbers.ball_limit) + config.plant.ball_radius
         time = jnp.linspace(0.0, 30.0, 200)
-        offset = jax.vmap(lambda one, t: jax.vmap(lambda s: paths(config, s, one))(t), in_axes=(0, None))(load, time)
+        path = jax.vmap(lambda one, t: jax.vmap(lambda s: paths(config, s, one))(t), in_axes=(0, None))
+        offset = jax.jit(path)(load, time)
         far = np.linalg.norm(np.asarray(offset), axis=-1).max(axis=1)
-        safe = jax.vmap(lambda n, m: safe_radius(n, 0, m, 0.15))(own, load.object_mass)
+        safe = jax.jit(jax.vmap(lambda n, m: safe_radius(n, 0, m, 0.15)))(own, load.object_mass)
         assert (far <= np.minimum(radius, safe) * (1 + 1e-4)).all()
         assert 0.1 < np.median(far / radius) < 0.9
         scales = np.asarray(own.drone_mass[:, 0])
@@ -242,6 +244,7 @@ class TestAgents:
         with pytest.raises(InputError, match="multiple of 11"):
             Agents(SIZES, 5, 32)
 
+    @pytest.mark.slow
     def test_actions_reach_their_followers_and_worlds_end_as_a_whole(self) -> None:
         config = settings(timing__episode_steps=3)
         env = TransportEnv(config, "newton-euler")

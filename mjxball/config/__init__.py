@@ -6,6 +6,7 @@ Importing it needs the standard library only.
 from mjxball.config._leaf import Range
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._load import follow_plant
+from mjxball.config._model_source import MAX_ELEMENTS, MAX_PIXELS
 from mjxball.config._plant import Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
 from mjxball.config._plausible import check_lift, thrust_over_weight, total_mass
@@ -38,12 +39,16 @@ from mjxball.config._tree import (
     to_json,
     to_text,
 )
-from mjxball.config._validate import ball_limit, cg_limit, validate
+from mjxball.config._validate import MOST_DRONES, THRUST_MARGIN, ball_limit, cg_limit, validate
 
 __all__ = [
+    "MAX_ELEMENTS",
+    "MAX_PIXELS",
+    "MOST_DRONES",
     "PLANTS",
     "PLANT_PARTS",
     "PRESETS",
+    "THRUST_MARGIN",
     "Attitude",
     "Autopilot",
     "Bounds",

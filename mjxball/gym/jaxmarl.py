@@ -13,7 +13,7 @@ from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import State, TransportEnv
-from mjxball.gym import common
+from mjxball.gym import core
 from mjxball.quiet import quietly
 
 try:
@@ -45,11 +45,10 @@ class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
     """
 
     def __init__(self, preset: str = "team", config: Config | None = None, physics: str = "newton-euler"):
-        self.config = common.settings(preset, config)
+        self.config = core.settings(preset, config)
         self._env = TransportEnv(self.config, physics)
-        self._drones = np.array(self.config.plant.followers)
-        super().__init__(len(self._drones))
-        self.agents = [f"follower_{number + 1}" for number in range(self.num_agents)]
+        super().__init__(len(self.config.plant.followers))
+        self.agents = core.agents(self.config)
         self.observation_spaces = dict.fromkeys(self.agents, Box(-np.inf, np.inf, (self._env.policy_input_size,)))
         self.action_spaces = dict.fromkeys(self.agents, Box(-1.0, 1.0, (ACTION_SIZE,)))
 
@@ -72,7 +71,7 @@ class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
         moved, there = self._state(world), self._there(world)
         rewards = self._each(jnp.where(there, jnp.reshape(world.reward, -1), 0.0))
         dones = {**self._each(moved.done | ~there), "__all__": moved.done}
-        info = {**common.info_of(world), "truncation": world.info["truncation"]}
+        info = {**core.info_of(world), "truncation": world.info["truncation"]}
         shared = {name: jnp.broadcast_to(value, self.num_agents) for name, value in info.items()}
         return self.get_obs(moved), moved, rewards, dones, shared
 
@@ -94,9 +93,7 @@ class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
         return FollowersState(done=world.done > 0, step=world.pipeline_state.steps, world=world)
 
     def _there(self, world: State) -> Array:
-        """Whether an agent is of this world's team (F,): drones that pad a smaller one have no mass."""
-        rig = world.pipeline_state.rig
-        return jnp.ones(self.num_agents, bool) if rig == () else rig.drone_mass[self._drones] > 0
+        return core.present(world.pipeline_state.rig, self.config.plant.followers)
 
     def _each(self, values: Array) -> Each:
         return dict(zip(self.agents, values, strict=True))

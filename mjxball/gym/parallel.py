@@ -2,54 +2,25 @@
 
 from __future__ import annotations
 
-import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import jax
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
-from mjxball.arrays import Array
 from mjxball.config import Config
-from mjxball.env import TransportEnv
-from mjxball.gym import common
-from mjxball.gym.single import PICTURE
-from mjxball.physics.step import make_cg_offset, on_the_host
-from mjxball.plant.teams import ring
-from mjxball.xla import enable_compilation_cache
+from mjxball.gym import core
 
 try:
     import pettingzoo
 except ModuleNotFoundError:
     raise ModuleNotFoundError("pettingzoo is not installed; pip install 'mjxball[gym]'", name="pettingzoo") from None
 
-METADATA: dict[str, Any] = {"name": "mjxball_followers_v0", "render_modes": ["rgb_array"], "render_fps": 50}
+METADATA: dict[str, Any] = {**core.METADATA, "name": "mjxball_followers_v0"}
 
 
-class Program(NamedTuple):
-    """The compiled functions of one world."""
-
-    env: TransportEnv
-    start: Any  # chain -> (chain, State)
-    step: Any  # (State, actions (F, 3), of a pair (3,)) -> State
-
-
-@functools.lru_cache(maxsize=8)
-def compiled_program(config: Config, physics: str) -> Program:
-    """The program of `config` on `physics`, compiled once for all environments of a process."""
-    common.check_process()
-    enable_compilation_cache()
-    env = TransportEnv(config, physics)
-
-    def start(chain: Array) -> tuple[Array, Any]:
-        chain, key = jax.random.split(chain)
-        return chain, env.reset(key)
-
-    return Program(env, jax.jit(start), jax.jit(env.step))
-
-
-class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
+class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
     """One world of `mjxball.env` in float32: each follower sees (n,) float32 and acts (3,) in [-1, 1] in its own frame.
 
     All share the goal and end together: `terminated` means that the object left d_term or that the world diverged,
@@ -59,7 +30,6 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
     """
 
     metadata = METADATA
-    _compiled = ("_program", "_cg_offset", "_scene")
 
     def __init__(
         self,
@@ -68,26 +38,15 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
         physics: str = "newton-euler",
         render_mode: str | None = None,
     ):
-        if render_mode not in (None, *METADATA["render_modes"]):
-            raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
-        self.config = common.settings(preset, config)
-        self.render_mode, self._physics = render_mode, physics
+        self.config = core.settings(preset, config)
+        self.render_mode = render_mode
         self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
-        self._drones = np.array(self.config.plant.followers)
-        with on_the_host():
-            self._program = compiled_program(self.config, physics)
-        self.possible_agents = [f"follower_{number + 1}" for number in range(len(self._drones))]
+        self._world = core.World(self.config, physics, render_mode)
+        self.possible_agents = core.agents(self.config)
         self.agents: list[str] = []
-        spaces = {agent: common.spaces(self._program.env) for agent in self.possible_agents}
+        spaces = {agent: core.spaces(self._world.program.env) for agent in self.possible_agents}
         self.observation_spaces = {agent: seen for agent, (seen, _) in spaces.items()}
         self.action_spaces = {agent: acts for agent, (_, acts) in spaces.items()}
-        self._cg_offset = make_cg_offset(self.config)
-        self._chain: Any = None
-        self._state: Any = None
-        self._scene: Any = None
-
-    def _arguments(self) -> dict[str, Any]:
-        return {"config": self.config, "physics": self._physics, "render_mode": self.render_mode}
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Space:
         """(n,) float32, the same for all."""
@@ -97,23 +56,16 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
         """(3,) in [-1, 1], the same for all."""
         return self.action_spaces[agent]
 
-    @common.in_float32
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """A fresh world drawn from `config.scenario`; seeds as of `FollowerEnv`, `options` are not used."""
-        common.check_process()
-        with on_the_host():
-            if seed is not None or self._chain is None:
-                self._chain = jax.random.key(common.seed_number(np_random(seed)[0]))
-            self._chain, self._state = self._program.start(self._chain)
-        self.agents = self.possible_agents[: self._count]
-        if self._scene is not None:
-            self._scene.close()
-            self._scene = None
+        anew = seed is not None or self._world.state is None
+        self._world.reset(core.seed_number(np_random(seed)[0]) if anew else None)
+        rig = jax.tree.map(np.asarray, self._world.state.pipeline_state.rig)
+        self.agents = self.possible_agents[: core.present(rig, self.config.plant.followers).sum()]
         return self._seen(), {agent: {} for agent in self.agents}
 
-    @common.in_float32
     def step(
         self, actions: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
@@ -122,18 +74,13 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
             raise gymnasium.error.ResetNeeded("call reset before step")
         if set(actions) != set(self.agents):
             raise ValueError(f"actions must be for {', '.join(self.agents)}, not for {', '.join(actions) or 'nobody'}")
-        common.check_process()
-        given = np.zeros((len(self._drones), 3), np.float32)
+        given = np.zeros((len(self.possible_agents), 3), np.float32)
         for number, agent in enumerate(self.agents):
-            given[number] = common.checked_action(actions[agent], self.action_spaces[agent].shape)
-        with on_the_host():
-            self._state = self._program.step(self._state, given if self._several else given[0])
-        state, agents = self._state, self.agents
-        truncated = bool(state.info["truncation"])
-        terminated = bool(state.done) and not truncated
-        info = {name: float(value) for name, value in common.info_of(state).items()}
-        rewards = np.reshape(np.asarray(state.reward), -1)
-        seen = self._seen()
+            given[number] = core.checked_action(actions[agent], self.action_spaces[agent].shape)
+        state, agents = self._world.step(given if len(given) > 1 else given[0]), self.agents
+        terminated, truncated = map(bool, core.ends_of(state))
+        info = {name: float(value) for name, value in core.info_of(state).items()}
+        rewards, seen = np.reshape(np.asarray(state.reward), -1), self._seen()
         if terminated or truncated:
             self.agents = []
         return (
@@ -146,36 +93,12 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
 
     def render(self) -> np.ndarray | None:
         """The team and its goal as pixels (height, width, 3) uint8, or None without a render mode."""
-        if self.render_mode is None or self._state is None:
-            gymnasium.logger.warn("render needs render_mode='rgb_array' and a reset before it")
-            return None
-        world = self._state.pipeline_state
-        if self._scene is None:
-            from mjxball.scene import Scene
-
-            plant, goal = self.config.plant, np.asarray(world.goal, float)
-            drawn = ring(plant, self._count + 1) if self.config.scenario.team_sizes else plant
-            self._scene = Scene(drawn, goal, PICTURE, (goal + np.asarray(world.plant.position)) / 2)
-        offset = self._cg_offset(world.plant, world.load)
-        return self._scene.picture(world.plant.position, world.plant.quaternion, np.asarray(offset))
+        return self._world.picture()
 
     def close(self) -> None:
         """Free the renderer."""
-        if self._scene is not None:
-            self._scene.close()
-            self._scene = None
-
-    @property
-    def _several(self) -> bool:
-        return len(self._drones) > 1
-
-    @property
-    def _count(self) -> int:
-        """Followers of this world's team: drones that pad a smaller one have no mass."""
-        rig = self._state.pipeline_state.rig
-        return len(self._drones) if rig == () else int((np.asarray(rig.drone_mass)[self._drones] > 0).sum())
+        self._world.close()
 
     def _seen(self) -> dict[str, np.ndarray]:
-        size = self._program.env.policy_input_size
-        shown = np.reshape(np.asarray(self._state.obs), (len(self._drones), -1))[:, :size]
-        return {agent: np.array(shown[number]) for number, agent in enumerate(self.agents)}
+        seen = np.atleast_2d(self._world.seen())
+        return {agent: seen[number].copy() for number, agent in enumerate(self.agents)}

@@ -5,6 +5,7 @@ Playground itself is not needed to import this.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from mjxball.arrays import Array
 from mjxball.assembly import build_model
 from mjxball.config import Config
 from mjxball.env import PipelineState, State, TransportEnv
-from mjxball.gym import common
+from mjxball.gym import core
 
 
 @flax.struct.dataclass
@@ -31,22 +32,16 @@ class PlaygroundState:
     info: dict[str, Any]
 
 
-class PlaygroundEnv(common.Picklable):
+class PlaygroundEnv:
     """`TransportEnv` with the attributes of Playground's `MjxEnv`. For its `wrap_for_brax_training`.
 
     Worlds are randomised by every reset, so Playground's `randomization_fn` has nothing to do here; use
     `full_reset=True`, or every episode of a world repeats its first one.
     """
 
-    _compiled = ("_pair", "_model")
-
     def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
-        self.config = common.pair_settings(preset, config)
+        self.config = core.pair_settings(preset, config)
         self._pair = TransportEnv(self.config, physics)
-        self._model: mujoco.MjModel | None = None
-
-    def _arguments(self) -> dict[str, Any]:
-        return {"config": self.config, "physics": self._pair.backend}
 
     def reset(self, rng: Array) -> PlaygroundState:
         """See `TransportEnv.reset`."""
@@ -92,12 +87,10 @@ class PlaygroundEnv(common.Picklable):
         """Empty: the model is built, see `python -m mjxball.assembly`."""
         return ""
 
-    @property
+    @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
         """The assembly as a MuJoCo model."""
-        if self._model is None:
-            self._model = build_model(self.config.plant)
-        return self._model
+        return build_model(self.config.plant)
 
     @property
     def mjx_model(self) -> Any:
@@ -110,14 +103,11 @@ class PlaygroundEnv(common.Picklable):
         self, trajectory: Sequence[PlaygroundState], height: int = 240, width: int = 320, *unused: Any
     ) -> list[np.ndarray]:
         """Pictures (height, width, 3) of unbatched states; Playground's camera and scene options are not used."""
-        from mjxball.physics.step import make_cg_offset
         from mjxball.scene import Scene
 
-        offset = make_cg_offset(self.config)
         goal = np.asarray(trajectory[0].data.goal, float)
         scene = Scene(self.config.plant, goal, (height, width), goal / 2)
-        poses = ((s.data.plant, float(offset(s.data.plant, s.data.load))) for s in trajectory)
-        pictures = [scene.picture(plant.position, plant.quaternion, c) for plant, c in poses]
+        pictures = [scene.picture(*core.pose_of(self.config, state.data)) for state in trajectory]
         scene.close()
         return pictures
 

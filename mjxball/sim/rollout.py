@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -44,7 +44,7 @@ Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with th
 
 
 class Tick(NamedTuple):
-    """One control step of n flights: what `Trajectory` holds for every step, without the contact wrenches."""
+    """One control step of n flights, as far as its metrics go: rows of a `Trajectory`."""
 
     time: float  # [s]
     position: Float[np.ndarray, "n 3"]  # of O in the world [m]
@@ -54,9 +54,6 @@ class Tick(NamedTuple):
     leader_command: Float[np.ndarray, "n 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Float[np.ndarray, "n ... 3"]  # likewise, (n, F, 3) of several followers
     diverged: Bool[np.ndarray, " n"]
-    state: PlantState | None = None
-    observation: Float[np.ndarray, "n ... 18"] | None = None  # (n, F, 18) of several followers
-    cg_offset: Float[np.ndarray, "n ..."] | None = None  # [m]
 
 
 @dataclass(frozen=True)
@@ -115,31 +112,26 @@ class Trajectory:
 
     def tick(self, number: int) -> Tick:
         """Control step `number` of a batch."""
-        names = ("position", "target", "euler", "rotor_force", "leader_command", "follower_command")
-        values = {name: getattr(self, name)[number] for name in names}
-        return Tick(float(self.time[number]), **values, diverged=self.diverged)
+        rows = {name: getattr(self, name)[number] for name in Tick._fields if name != "diverged"}
+        return Tick(**rows, diverged=self.diverged)
 
     def copied(self) -> Trajectory:
         """The same with memory of its own: `world` shares that of its whole batch."""
-        return Trajectory(**{item.name: np.array(getattr(self, item.name)) for item in dataclasses.fields(self)})
+        return self._each(lambda value, _: np.array(value))
 
     def batched(self) -> Trajectory:
         """A single flight as a batch of one."""
-        parts = {}
-        for item in dataclasses.fields(self):
-            value = getattr(self, item.name)
-            per_flight = item.name in ("goal", "diverged")
-            parts[item.name] = value if item.name == "time" else np.expand_dims(value, 0 if per_flight else 1)
-        return Trajectory(**parts)
+        return self._each(np.expand_dims)
 
     def world(self, index: int) -> Trajectory:
         """Flight `index` of a batch."""
-        parts = {}
-        for item in dataclasses.fields(self):
-            value = getattr(self, item.name)
-            per_flight = item.name in ("goal", "diverged")
-            parts[item.name] = value if item.name == "time" else value[index] if per_flight else value[:, index]
-        return Trajectory(**parts)
+        return self._each(lambda value, axis: value[:, index] if axis else value[index])
+
+    def _each(self, change: Callable[[np.ndarray, int], np.ndarray]) -> Trajectory:
+        """The same with `change(array, number of its batch axis)` of all arrays but the time."""
+        parts = {item.name: getattr(self, item.name) for item in dataclasses.fields(self) if item.name != "time"}
+        axes = {"goal": 0, "diverged": 0}
+        return Trajectory(self.time, **{name: change(value, axes.get(name, 1)) for name, value in parts.items()})
 
 
 def simulate(
@@ -169,7 +161,27 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     All scenarios must last equally long. Each follower is called once per control step for its own part.
     """
     scenarios, act = _together(config, flights)
-    return _record(config, scenarios, act, physics, on_pid_of(flights))
+    cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
+    count = round(scenarios[0].seconds / period)
+    load, target = load_of(config, scenarios), targets(config, scenarios, count + 1)
+    disturbances, followers = [scenario.disturbance for scenario in scenarios], followers_axis(config)
+    samples, on_pid = record(disturbances, count + 2, period, followers), on_pid_of(flights)
+    sensors, delays = sensors_of(disturbances, period, followers)
+    loop = ClosedLoop(config, make_stepper(config, physics), sensors)
+    state, observation = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
+    plants, rows = [], []
+    for number in range(count + 1):
+        plant, goals, diverged = state.plant, (target[number], target[number + 1]), state.diverged
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+        answer = act(observation, partial(privileged, plant, load))
+        acting, seen = load._replace(external_force=samples.at(number).force), observation
+        state, observation, commands = loop.step(state, seen, answer, acting, goals, samples.at(number + 1), on_pid)
+        plants.append(plant)
+        rows.append((euler, *commands, seen, cg_offset(plant, load)))
+    flown = plants[0].each(lambda *leaves: np.stack(leaves), *plants[1:])
+    pushed = load._replace(external_force=samples.at(slice(count + 1)).force)
+    stacked = [np.stack(part) for part in zip(*rows, strict=True)]
+    return _trajectory(config, flown, stacked, target[:-1], diverged, pushed, physics)
 
 
 def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
@@ -206,53 +218,23 @@ def on_pid_of(flights: Flights) -> Float[np.ndarray, " n"]:
     return np.array([0.0 if isinstance(follower, Baseline) else 1.0 for follower, part in flights for _ in part])
 
 
-def fly(
-    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, on_pid: Float[np.ndarray, " n"] | None = None
-) -> Iterator[Tick]:
-    """Every control step of all scenarios at once, the start first; `act` is the followers' laws.
-
-    `on_pid` as from `on_pid_of`; None: all of them policies.
-    """
-    on_pid = np.ones(len(scenarios)) if on_pid is None else on_pid
-    cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
-    count = round(scenarios[0].seconds / period)
-    load, target = load_of(config, scenarios), targets(config, scenarios, count + 1)
-    disturbances, followers = [scenario.disturbance for scenario in scenarios], followers_axis(config)
-    samples = record(disturbances, count + 2, period, followers)
-    sensors, delays = sensors_of(disturbances, period, followers)
-    loop = ClosedLoop(config, make_stepper(config, physics), sensors)
-    state, observation = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
-    for number in range(count + 1):
-        plant, goals = state.plant, (target[number], target[number + 1])
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-        answer = act(observation, partial(privileged, plant, load))
-        acting = load._replace(external_force=samples.at(number).force)
-        after = loop.step(state, observation, answer, acting, goals, samples.at(number + 1), on_pid)
-        # The time is exact, so that a mass change falls on the same row for every engine.
-        flown = (plant.position, goals[0], euler, plant.rotor_force, *after[2], state.diverged)
-        yield Tick(number * period, *flown, plant, observation, cg_offset(plant, load))
-        state, observation, _ = after
-
-
-def _record(
-    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, on_pid: Float[np.ndarray, " n"]
+def _trajectory(
+    config: Config,
+    flown: PlantState,
+    rows: Sequence[np.ndarray],
+    target: np.ndarray,
+    diverged: np.ndarray,
+    load: Load,
+    physics: str,
 ) -> Trajectory:
-    ticks = list(fly(config, scenarios, act, physics, on_pid))
-    grid = np.array([tick.time for tick in ticks])
-    load, count = load_of(config, scenarios), len(ticks)
-    force = record([s.disturbance for s in scenarios], count, config.timing.control_period).force
-    target, euler, leader_command, follower_command, observation, offset = (
-        np.stack([getattr(tick, name) for tick in ticks])
-        for name in ("target", "euler", "leader_command", "follower_command", "observation", "cg_offset")
-    )
-    diverged = ticks[-1].diverged
-    states = [tick.state for tick in ticks if tick.state is not None]
-    flown = states[0].each(lambda *leaves: np.stack(leaves), *states[1:])
-    flown = flown._replace(time=np.broadcast_to(grid[:, None], flown.time.shape))
-    load = load._replace(external_force=force)
+    """Of recorded states (T, n, ...) with what goes with each: attitude, commands, observation and CG offset."""
+    # The time is exact, so that a mass change falls on the same row for every engine.
+    time = np.arange(len(target)) * config.timing.control_period
+    flown = flown._replace(time=np.broadcast_to(time[:, None], flown.time.shape))
+    euler, leader_command, follower_command, observation, cg_offset = rows
     force, torque = flown_contact_wrenches(config, flown, load, physics)
     return Trajectory(
-        time=grid,
+        time=time,
         position=flown.position,
         velocity=flown.velocity,
         euler=euler,
@@ -262,7 +244,7 @@ def _record(
         leader_command=leader_command,
         follower_command=follower_command,
         observation=observation,
-        cg_offset=offset,
+        cg_offset=cg_offset,
         object_mass=object_mass(flown.time, load),
         contact_force=force,
         contact_torque=torque,

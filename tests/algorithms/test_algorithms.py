@@ -250,7 +250,7 @@ def test_adam_keeps_what_the_settings_say(slow: float, square: float, transport:
     np.testing.assert_allclose(state.layers["hidden_0"]["bias"][0], expected, rtol=1e-5)  # float32
 
 
-@pytest.mark.parametrize("name", ["ppo", "gradient"])
+@pytest.mark.parametrize("name", [pytest.param("ppo", marks=pytest.mark.slow), "gradient"])
 def test_a_point_is_pushed_to_rest(name: str, transport: Config) -> None:
     """Over 80 steps a clipped LQR whose push is free earns -0.022 a step, one that does nothing -2.5 (NumPy)."""
     config = with_settings(transport, timing={"episode_steps": 80}, **{name: SMALL[name]})
@@ -259,7 +259,8 @@ def test_a_point_is_pushed_to_rest(name: str, transport: Config) -> None:
     assert after > -0.06
 
 
-@pytest.mark.parametrize("name", ["ppo", "gradient", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ppo", "gradient", "sac"])
 def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     config = with_settings(transport, timing={"episode_steps": 80}, **{name: SMALL[name]})
     extensions = Extensions(toys.DoubleIntegrator, None, find(name, "--algorithm"))

@@ -101,6 +101,7 @@ def test_installed_commands_are_completed_by_their_own_name(
         assert re.search(rf"^complete .* {name}$", capsys.readouterr().out, re.MULTILINE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxfly", "--version"), ("eval.py", "--list")])
 @pytest.mark.parametrize("buffered", [True, False])
 def test_what_cannot_be_printed_is_said(words: tuple[str, ...], buffered: bool) -> None:
@@ -122,6 +123,7 @@ def test_what_cannot_be_printed_is_said(words: tuple[str, ...], buffered: bool) 
     assert_one_line(done.stderr)
 
 
+@pytest.mark.slow
 def test_without_the_train_extra_a_command_says_what_to_install(tmp_path: Path) -> None:
     script = "import sys; sys.modules['mujoco'] = None; from mjxball.entry import evaluate; sys.exit(evaluate())"
     done = subprocess.run(
@@ -141,6 +143,7 @@ def test_without_the_train_extra_a_command_says_what_to_install(tmp_path: Path) 
     assert "mjxball[train]" in refusal
 
 
+@pytest.mark.slow
 def test_interrupted_export_ends_silently(tmp_path: Path) -> None:
     """Ctrl-C while it imports JAX, which is most of what it does: held there by a finder that dawdles."""
     holder = (

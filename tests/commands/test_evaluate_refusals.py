@@ -166,6 +166,7 @@ def test_card_that_is_not_json_is_refused(here: Path, capsys: pytest.CaptureFixt
     assert "card" in refused(here, [*FAST, "odd.npz"], capsys)
 
 
+@pytest.mark.slow
 def test_refusal_of_a_real_process(here: Path) -> None:
     (here / "odd.npz").write_bytes(TRANSPORT.read_bytes()[:2000])
     assert_process_refuses([script("eval.py"), "odd.npz"], here)

@@ -99,6 +99,7 @@ echo "${{COMPREPLY[@]}}"
 """
 
 
+@pytest.mark.slow
 def test_bash_completes_what_the_script_says(helped: Helped, tmp_path: Path) -> None:
     script = tmp_path / "completion.sh"
     script.write_text(helped("train", "--print-completion", "bash"))
@@ -114,6 +115,7 @@ def test_bash_completes_what_the_script_says(helped: Helped, tmp_path: Path) -> 
     assert "#compdef" in helped("eval", "--print-completion", "zsh")
 
 
+@pytest.mark.slow
 def test_no_command_imports_what_only_completion_and_tables_need() -> None:
     """They would be a fifth of a second of every start."""
     look = "import sys; from {} import {} as p; p(); print(sorted({{'rich', 'shtab', 'IPython'}} & set(sys.modules)))"

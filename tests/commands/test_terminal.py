@@ -72,6 +72,7 @@ def test_progress_fits_and_leaves_nothing_behind(
     assert len(shown) >= {40: 2, 80: 5, 0: 5}.get(columns, len(parts))
 
 
+@pytest.mark.slow
 def test_a_dumb_terminal_and_a_pipe_have_a_line_a_row(training: list[str], tmp_path: Path) -> None:
     dumb = on_terminal(training, 80, tmp_path, term="dumb")
     piped = subprocess.run(training, capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT, check=True)

@@ -335,5 +335,6 @@ def test_a_misspelt_flag_is_answered_with_the_right_one(here: Path, capsys: pyte
     assert "--frobnicate\n" in assert_refused(main, ["--frobnicate"], here, capsys)  # like none
 
 
+@pytest.mark.slow
 def test_refusal_of_a_real_process(here: Path) -> None:
     assert_process_refuses([script("train.py"), "--out", "full"], here)

@@ -254,13 +254,14 @@ def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
     jnp, law = jax.numpy, crazyflie.STOCK
     draw = np.random.default_rng(0).normal(size=(400, 3)) * [0.1, 0.1, 2.0]
 
+    @jax.jit
     def sent(command: Any) -> Any:
         mass = jnp.full(command.shape[:-1], 0.0377, jnp.float32)
         return crazyflie.setpoints(law, jnp.asarray(command, jnp.float32), mass, 9.81)
 
-    thrust = np.asarray(jax.jit(sent)(draw))[:, 3]
+    thrust = np.asarray(sent(draw))[:, 3]
     assert (thrust == np.round(thrust)).all()
-    slope = jax.grad(lambda az: sent(jnp.stack([0.0, 0.0, az]))[3])(0.3)
+    slope = jax.jit(jax.grad(lambda az: sent(jnp.stack([0.0, 0.0, az]))[3]))(0.3)
     # The calibrated law's own slope: a step of 0.1 m/s2 moves the rounded thrust by as much, to a unit.
     step = float(sent(jnp.array([0.0, 0.0, 0.35]))[3] - sent(jnp.array([0.0, 0.0, 0.25]))[3])
     assert slope == pytest.approx(step / 0.1, abs=10.0)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from command_line import REPOSITORY, call
-from tables import rows
+from tables import rows, weekly
 
 from batch import Batch
 from mjxball.baselines import make_baseline
@@ -26,7 +26,7 @@ from mjxball.sim.scenario import Scenario
 from mjxball.view import main as view
 
 CARD = {"flown": {"drones": [2, 3], "seconds": 60}}
-UNIVERSAL = shipped_policy("universal")
+UNIVERSAL, FLIGHT = shipped_policy("universal"), shipped_policy("flight")
 MEASURED = REPOSITORY / "benchmarks" / "results" / "horizon.json"
 
 
@@ -86,7 +86,9 @@ def horizon() -> ModuleType:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", shipped_policies(), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [FLIGHT, *weekly(*sorted({*shipped_policies()} - {FLIGHT}))], ids=lambda path: path.stem
+)
 def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
     """Its load at rest, and moving slowly and quickly: nothing is lost, and what its card is good for stays steady."""
     flown = Policy.load(path).card["flown"]

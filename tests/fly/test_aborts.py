@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from fly_virtual import VirtualTwin, thrusts
+from tables import weekly
 
 from mjxball.policy import Policy, shipped_policy
 from mjxfly.limits import FlightSettings, Times
@@ -108,11 +109,13 @@ SECONDS = 8.0
 SAFE_WITHIN = 9.0  # [s] battery_time 5, then LAND; all others are far below
 
 
-# Every fault at one drone in the first tier, alternately, and at the other in the second.
+FIRST = (lost, jump, crash, interrupt, kill)  # one of each way to end
+# Every fault at one drone, alternately, and at the other weekly.
 AT = [
-    pytest.param(fault, number, marks=() if index % 2 == number else pytest.mark.slow, id=f"{fault.__name__}-{number}")
+    pytest.param(fault, number, marks=marks, id=f"{fault.__name__}-{number}")
     for index, fault in enumerate(FAULTS)
     for number in (0, 1)
+    for marks in [pytest.mark.release if index % 2 != number else () if fault in FIRST else pytest.mark.slow]
 ]
 
 
@@ -137,7 +140,7 @@ def test_any_fault_brings_both_down(fault: Callable[[VirtualTwin, int], None], n
 
 
 @pytest.mark.parametrize("fault", [silence, lost, silence_up], ids=lambda fault: fault.__name__)
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, *weekly(1)])
 def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
     fault: Callable[[VirtualTwin, int], None], number: int
 ) -> None:
@@ -171,6 +174,7 @@ def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> No
     assert world.running() == [False, False]
 
 
+@pytest.mark.slow
 def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)
@@ -220,6 +224,7 @@ def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
     assert world.running() == [False, False]
 
 
+@pytest.mark.slow
 def test_states_that_break_off_again_and_again_end_the_flight() -> None:
     world = VirtualTwin(FlightSettings(seconds=60.0))
     world.fly_until(State.FLY)

@@ -54,6 +54,7 @@ def test_a_free_flight_rises_stays_and_lands() -> None:
     assert world.running() == [False, False]
 
 
+@pytest.mark.slow
 def test_the_papers_stand_lifts_off_rolls_and_comes_down() -> None:
     world = world_of("stand", 3.0)
     world.fly_until(State.FLY)
@@ -68,6 +69,7 @@ def test_the_papers_stand_lifts_off_rolls_and_comes_down() -> None:
     assert np.abs(world.state.position[:, 2]).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_leader_flies_the_cards_law(preset: str) -> None:
     config = card.config_of(untrained(preset).card)

@@ -46,6 +46,7 @@ def error_of(world: VirtualTwin, after: float) -> np.ndarray:
     return late - (world.flight._monitor.origin + np.array(world.settings.goal))
 
 
+@pytest.mark.slow
 def test_two_flights_in_a_row_need_no_reboot() -> None:
     """Defect 2: silence while the firmware counts as flying locks it. Zeros go on until it does not."""
     world = world_of("flight", 0.5)
@@ -62,6 +63,7 @@ def test_two_flights_in_a_row_need_no_reboot() -> None:
         assert not any(drone.firmware.info & LOCKED for drone in world.drones)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "curve", ["older", *(pytest.param(curve, marks=pytest.mark.slow) for curve in ("linear", "cubic"))]
 )
@@ -87,6 +89,7 @@ def pushed(world: VirtualTwin, monkeypatch: pytest.MonkeyPatch, *vertical: float
     monkeypatch.setattr(flight.controller, "step", ask)
 
 
+@pytest.mark.slow
 def test_thrust_moves_as_fast_as_the_law_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Defect 4: a slew limit of 1200 units a tick, which training does not have, took 0.4 of the roll authority."""
     world = world_of("flight", 2.0)
@@ -98,6 +101,7 @@ def test_thrust_moves_as_fast_as_the_law_asks(monkeypatch: pytest.MonkeyPatch) -
     assert np.abs(np.diff(ticks[-10:])).min() == pytest.approx(2 / 9.81 * hover, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_stand_has_a_ceiling_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Defect 5: O rose to 0.8 - 1.4 m before anything ended the flight."""
     world = world_of("stand", 10.0)
@@ -140,6 +144,7 @@ def test_the_stand_keeps_its_ball_under_the_estimators_sideways_motion() -> None
     assert abs(roll_of_quaternion(seen.quaternion)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "drones"), [("lost", (0,)), ("lost", (0, 1)), ("jump", (1,)), ("frozen", (0,))])
 def test_an_estimator_that_loses_its_pose_brings_the_pair_down_gently(kind: str, drones: tuple[int, ...]) -> None:
     """Defect 6: lost poses were not noticed, frozen ones cut the motors at 0.2 m, a jump at 0.4 m (2.7 m/s)."""
@@ -154,6 +159,7 @@ def test_an_estimator_that_loses_its_pose_brings_the_pair_down_gently(kind: str,
     assert not any(world.running())
 
 
+@pytest.mark.slow
 def test_a_gap_in_the_states_costs_nothing() -> None:
     """Defect 8: 110 ms without states gave 1.9 s of blind flight and 0.25 to 0.48 m of drift."""
     world = world_of("flight", 4.0)

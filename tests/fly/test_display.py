@@ -24,8 +24,6 @@ from mjxfly.limits import Limits
 from mjxfly.packets import ZERO, DroneState
 from mjxfly.supervisor import Event, Fault, State, Supervisor
 
-pytestmark = pytest.mark.clock  # keys and pictures by the clock
-
 LIMITS = Limits()
 
 
@@ -74,6 +72,7 @@ def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
     assert [re.sub(r"\x1b\[[\d;]*m", "", line) for line in coloured] == shown
 
 
+@pytest.mark.clock
 def test_what_is_redrawn_covers_what_was_drawn() -> None:
     """In a terminal of 60 columns, by a terminal's own rules for long lines and the cursor."""
     ours, theirs = pty.openpty()
@@ -90,6 +89,7 @@ def test_what_is_redrawn_covers_what_was_drawn() -> None:
         assert max(len(re.sub(r"\x1b\[[\d;]*m", "", line).rstrip("\r")) for line in text.split("\n")) < 60
 
 
+@pytest.mark.clock
 def test_what_cannot_go_back_a_line_gets_one_a_phase(monkeypatch: pytest.MonkeyPatch) -> None:
     views = [view(State.RAMP)] * 2 + [view()] * 2 + [view(State.LAND, Fault(Event.BATTERY, "leader at 3.1 V"))] * 20
     stream = io.StringIO()
@@ -132,6 +132,7 @@ def read_until(number: int, wanted: bytes, seconds: float = 20) -> bytes:
     return data
 
 
+@pytest.mark.clock
 @pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)])
 def test_signals_land_without_a_terminal(signals: tuple[signal.Signals, ...]) -> None:
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE}
@@ -144,6 +145,7 @@ def test_signals_land_without_a_terminal(signals: tuple[signal.Signals, ...]) ->
         assert child.stdout.readline() == "heard interrupt land land\n"
 
 
+@pytest.mark.clock
 def test_keys_in_a_terminal(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     with subprocess.Popen([sys.executable, "-c", SCRIPT], stdin=theirs, stdout=theirs, env=environment()):

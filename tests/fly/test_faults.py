@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from fly_virtual import VirtualTwin as StandInTwin
-from tables import rows
+from tables import rows, weekly
 
 from mjxball.control import motors
 from mjxball.control.motors import MOTORS
@@ -53,7 +53,8 @@ def cut(track: list[Moment]) -> Moment:
     return next(moment for moment in track if moment.pwm.max() == 0)
 
 
-@pytest.mark.parametrize("drone", [1, pytest.param(0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("drone", [1, *weekly(0)])
 def test_both_stand_before_the_firmware_cuts_a_drone_that_hears_nothing(drone: int) -> None:
     """It was found after 0.5 s, the plan thought that both sink, and the follower was cut at 0.2 m: 1.9 m/s."""
     world = hovering()
@@ -69,7 +70,7 @@ def test_both_stand_before_the_firmware_cuts_a_drone_that_hears_nothing(drone: i
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("first", [0, *weekly(1)])
 def test_uplinks_lost_one_soon_after_the_other_leave_the_stick_level(first: int) -> None:
     """0.3 s apart: the first loss was noticed after the second, both hovered, and 0.3 s between the firmwares' cuts
     turned the stick over. Noticed before, the second keeps a thrust by which both are down first.
@@ -120,6 +121,7 @@ def test_a_descent_has_the_time_that_its_height_asks() -> None:
         assert FlightSettings().times.descent_limit(height) == pytest.approx(seconds, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_dead_imu_is_told_as_one() -> None:
     """It was "unheard": the log goes on with fresh stamps, and nothing in it moves."""
     world = hovering()
@@ -132,6 +134,7 @@ def test_a_dead_imu_is_told_as_one() -> None:
     assert "m/s" not in told[-1]
 
 
+@pytest.mark.slow
 def test_an_uplink_that_comes_back_is_flown_through() -> None:
     world = StandInTwin(FlightSettings(seconds=6.0))
     world.fly_until(State.FLY)
@@ -157,6 +160,7 @@ def lift(voltage: float) -> float:
     return float(full) / (own.carried_mass * own.gravity)
 
 
+@pytest.mark.slow
 def test_a_battery_that_fades_is_noticed_before_lift_is_lost() -> None:
     """0.5 V/s: from 3.85 V in hover there are two seconds until full power does not carry."""
     world = hovering()
@@ -169,7 +173,7 @@ def test_a_battery_that_fades_is_noticed_before_lift_is_lost() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drones", [(0, 1), (1,)])
+@pytest.mark.parametrize("drones", [(0, 1), *weekly((1,))])
 def test_a_battery_that_gives_way_at_once_lets_the_pair_fall_level(drones: tuple[int, ...]) -> None:
     """Thrust for 0.85 of the weight is left, and nothing cushions that; one drone alone turned the stick over."""
     world = hovering()
@@ -186,7 +190,7 @@ def test_a_battery_that_gives_way_at_once_lets_the_pair_fall_level(drones: tuple
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drones", [(0, 1), (1,)])
+@pytest.mark.parametrize("drones", [(0, 1), *weekly((1,))])
 def test_voltages_that_read_wrongly_low_do_not_make_a_descent_climb(drones: tuple[int, ...]) -> None:
     """Both were given all power, and rose to 17 m."""
     world = hovering()

@@ -349,6 +349,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_it_is_readable_after_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "flight.jsonl"
     command = [sys.executable, "-c", SCRIPT, path, json.dumps(HEADER["config"])]

@@ -112,6 +112,7 @@ def times_of(path: Path) -> list[int]:
         return [time for _, time, _ in reader.messages(goals)]
 
 
+@pytest.mark.slow
 def test_a_killed_recorder_leaves_a_whole_file(log: Path, tmp_path: Path) -> None:
     """All but what came after its last chunk, for `rosbags`, mcap's own streaming reader and ours."""
     stream_reader = pytest.importorskip("mcap.stream_reader")
@@ -127,6 +128,7 @@ def test_a_killed_recorder_leaves_a_whole_file(log: Path, tmp_path: Path) -> Non
     assert (kinds.count("DataEnd"), kinds[-1]) == (1, "Footer")
 
 
+@pytest.mark.slow
 def test_a_recorder_on_a_full_disk_says_so() -> None:
     full = Path("/dev/full")
     if not full.exists():
@@ -154,6 +156,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_the_recorder_of_a_killed_runner_ends_its_file(log: Path, flight: Recording, tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     lines = log.read_bytes().splitlines(keepends=True)
@@ -173,6 +176,7 @@ def test_the_recorder_of_a_killed_runner_ends_its_file(log: Path, flight: Record
     np.testing.assert_array_equal(again.position, flight.position)
 
 
+@pytest.mark.slow
 def test_a_recorder_that_ends_is_told_of(log: Path, tmp_path: Path) -> None:
     """The flight goes on; the log says that it is not complete."""
     notes = Journal(tmp_path / "flight.mcap", policy="no header of a flight")

@@ -99,6 +99,7 @@ def test_an_install_that_cannot_write_mcap_is_refused(monkeypatch: pytest.Monkey
             assert "pip install 'mjxball[fly]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
     modules = [
         "main",

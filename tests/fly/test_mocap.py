@@ -359,7 +359,13 @@ IN_FLIGHT: list[tuple[str, Spoil, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "cause"), [case[1:] for case in IN_FLIGHT], ids=[case[0] for case in IN_FLIGHT])
+@pytest.mark.parametrize(
+    ("spoil", "cause"),
+    [
+        pytest.param(*case[1:], id=case[0], marks=pytest.mark.slow if index > 2 else ())
+        for index, case in enumerate(IN_FLIGHT)
+    ],
+)
 def test_bad_poses_bring_both_down_gently_and_are_never_sent(spoil: Spoil, cause: str) -> None:
     seen = Seen(spoil)
     found = seen.fly()

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, environment
 from conftest import too_busy
+from tables import weekly
 
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
@@ -135,7 +136,7 @@ def test_the_last_line_tells_where_the_object_is(name: str, flights: dict[str, E
     assert np.abs(np.array(told[0][:3], float) - moved).max() < 0.03  # the estimators' noise on a stand
 
 
-@pytest.mark.parametrize("onboard", [(), ("--onboard",)])
+@pytest.mark.parametrize("onboard", [(), *weekly(("--onboard",))])
 def test_runner_watchdog_and_twin_share_a_slower_clock(onboard: tuple[str, ...], tmp_path: Path) -> None:
     if onboard and shutil.which("gcc") is None:
         pytest.skip("needs gcc")
@@ -173,7 +174,10 @@ def flies(log: Path, process: subprocess.Popen[str]) -> bool:
     ("who", "how", "code", "said"),
     [
         ("twin", signal.SIGSTOP, 2, f"{TOO_SLOW} in real time: .* --slow 2"),
-        ("runner", signal.SIGSTOP, -signal.SIGKILL, f"{TOO_SLOW} in real time: .* --slow 2"),
+        pytest.param(
+            *("runner", signal.SIGSTOP, -signal.SIGKILL, f"{TOO_SLOW} in real time: .* --slow 2"),
+            marks=pytest.mark.release,
+        ),
         ("twin", signal.SIGKILL, 2, "the twin has ended: it was killed, or it crashed"),
     ],
 )

@@ -106,3 +106,27 @@ def test_nothing_happens_without_an_event() -> None:
     for state in State:
         supervisor = Supervisor(state, 5.0)
         assert supervisor.after([], 9.0) is supervisor
+
+
+def test_only_a_gap_that_broke_into_flight_may_close() -> None:
+    began = (
+        (State.RAMP, State.FLY, State.LAND, State.DESCEND),
+        (Event.STALE, Event.UNHEARD, Event.LINK_LOST, Event.FROZEN),
+    )
+    for state, event in itertools.product(*began):
+        held = Supervisor(state).after([Fault(event)], 1.0)
+        guided, gap = state in (State.FLY, State.LAND), event in (Event.STALE, Event.UNHEARD)
+        assert held.may_resume is (guided and gap), (state, event)
+    assert not Supervisor(State.FLY, cause=Fault(Event.STALE)).may_resume
+
+
+def test_time_is_a_fault_only_where_something_else_should_have_ended_the_state() -> None:
+    for state in State:
+        for event in (Event.TIMEOUT, Event.INTERRUPT):
+            cause = Supervisor(state).after([Fault(event)], 1.0).cause
+            fault = event is Event.TIMEOUT and state in (State.ARM, State.SPIN, State.RAMP)
+            assert cause == (Fault(event) if fault else None), (state, event)
+
+
+def test_a_fault_is_told_with_what_is_known_of_it() -> None:
+    assert [str(Fault(Event.LINK_LOST)), str(Fault(Event.STALE, "leader"))] == ["link lost", "stale: leader"]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, environment
 from conftest import too_busy
-from tables import rows
+from tables import rows, weekly
 
 from mjxball.policy import load_file
 from mjxfly import flight_log, packets, watchdog
@@ -65,6 +65,7 @@ def test_silence_in_the_air_is_a_hang_and_the_runner_is_killed() -> None:
     assert left[1] >= watchdog.SILENCE
 
 
+@pytest.mark.slow
 def test_silence_counts_from_when_a_frame_was_written(monkeypatch: pytest.MonkeyPatch) -> None:
     """A watchdog that woke late read one that was 0.28 s old, and waited for another 0.3 s."""
     waited: list[float | None] = []
@@ -83,6 +84,7 @@ def test_silence_counts_from_when_a_frame_was_written(monkeypatch: pytest.Monkey
     assert left == (SEEN, pytest.approx(0.28))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [IDLE, GOODBYE])
 def test_on_the_ground_nothing_is_taken_over(last: int) -> None:
     assert watched([packed(FLYING, SEEN), packed(last, NOTHING)]) is None
@@ -233,7 +235,10 @@ TAKEN_OVER = 0.4  # [s] after the last setpoint
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("phase", ["ramp", "fly", "land", "descend", "hold", "stop"])
+@pytest.mark.parametrize(
+    "phase",
+    ["fly", "hold", *weekly("ramp", "land", "descend", "stop")],
+)
 def test_a_main_thread_that_stands_still_at_a_change_of_phase_is_found(phase: str, tmp_path: Path) -> None:
     """Its other threads go on: states come, the display writes, pings go out."""
     flight = brought_down(flown(tmp_path, None, ["-c", SPOILED, phase, "stands", "--seconds", "1"]))

@@ -26,7 +26,8 @@ from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.results import fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE
-from mjxball.gym import common
+from mjxball.gym import core
+from mjxball.gym.parallel import FollowersParallelEnv
 from mjxball.gym.playground import PlaygroundEnv
 from mjxball.gym.single import FollowerEnv
 from mjxball.gym.vector import FollowerVectorEnv
@@ -86,7 +87,7 @@ def test_it_flies_as_the_brax_environment(name: str, request: pytest.FixtureRequ
     config = replace(preset(name), "follower.recurrent_units", 0)  # as Gymnasium has it
     env = FollowerEnv(config=config)
     first, _ = env.reset(seed=7)
-    _, key = jax.random.split(jax.random.key(common.seed_number(np_random(7)[0])))
+    _, key = jax.random.split(jax.random.key(core.seed_number(np_random(7)[0])))
     pair = request.getfixturevalue("fast_pair") if name == "transport" else compile_env(config, "newton-euler")
     state = pair.reset(key)
     size = len(first)
@@ -164,8 +165,9 @@ def test_the_time_limit_truncates_and_leaving_terminates(short: Config):
     ends = [env.step(STILL)[2:4] for _ in range(8)]
     assert ends == [*[(False, False)] * 7, (False, True)]
     env.reset(seed=3)
-    world = env._state.pipeline_state
-    env._state = env._state.replace(pipeline_state=world._replace(goal=world.goal + jnp.array([0.0, 0.0, 5.0])))
+    state = env._world.state
+    goal = state.pipeline_state.goal + jnp.array([0.0, 0.0, 5.0])
+    env._world.state = state.replace(pipeline_state=state.pipeline_state._replace(goal=goal))
     assert env.step(STILL)[2:4] == (True, False)
 
 
@@ -187,21 +189,23 @@ NO_ACTIONS = {
 
 
 def test_actions_are_clipped_to_the_box_and_refused_unless_they_are_finite(short: Config):
-    """Alike in one world and in a vector, which stay as they were; tests/gym/test_parallel.py of followers."""
+    """Alike in one world, in a vector and of PettingZoo's followers, which stay as they were."""
     single = FollowerEnv(config=short, physics="newton-euler")
     vector = FollowerVectorEnv(2, config=short, physics="newton-euler")
-    for env, shape in ((single, (3,)), (vector, (2, 3))):
+    parallel = FollowersParallelEnv(config=short)
+    each = lambda action: parallel.step({"follower_1": action})  # noqa: E731
+    for env, step, shape in ((single, single.step, (3,)), (vector, vector.step, (2, 3)), (parallel, each, (3,))):
         found = []
         for action in (OUTSIDE, CLIPPED):
-            env.reset(seed=3)
+            first = env.reset(seed=3)[0]
             for bad, named in NO_ACTIONS.values():
                 both = [bad, bad] if env is vector and getattr(bad, "shape", ()) == (3,) else bad
                 with pytest.raises(InputError, match=re.escape(f"of shape {shape}") + ".*" + named):
-                    env.step(both)
-            found.append([env.step(np.broadcast_to(action, shape))[:2] for _ in range(3)])
-        for one, other in zip(*found, strict=True):
-            jax.tree.map(np.testing.assert_array_equal, one, other)
-        assert np.abs(found[0][2][0] - env.reset(seed=3)[0]).max() > 1e-3  # the actions did something
+                    step(both)
+            found.append([step(np.broadcast_to(action, shape))[:2] for _ in range(3)])
+        jax.tree.map(np.testing.assert_array_equal, *found)
+        began, ended = jax.tree.leaves((first, found[0][2][0]))
+        assert np.abs(ended - began).max() > 1e-3  # the actions did something
 
 
 def test_mistakes_are_named():
@@ -319,7 +323,7 @@ def test_workers_are_spawned_or_refused(tmp_path: Path, monkeypatch: pytest.Monk
 def test_make_vec_takes_mjx():
     vector = gymnasium.make_vec("mjxball/Transport-v0", num_envs=2, vectorization_mode="vector_entry_point")
     assert isinstance(vector.unwrapped, FollowerVectorEnv)
-    assert vector.unwrapped._program.pair.backend == "mjx"
+    assert vector.unwrapped._worlds.program.env.backend == "mjx"
 
 
 RENDER = """

@@ -12,8 +12,8 @@ from conftest import with_settings
 from gymnasium.utils.seeding import np_random
 
 from mjxball.config import Config, preset, with_plant
-from mjxball.gym import common
-from mjxball.gym.parallel import FollowersParallelEnv, compiled_program
+from mjxball.gym import core
+from mjxball.gym.parallel import FollowersParallelEnv
 
 pytest.importorskip("jaxmarl")
 from jaxmarl.environments.multi_agent_env import MultiAgentEnv, State
@@ -45,7 +45,7 @@ def draws(env: MultiAgentEnv, key: Any) -> dict[str, Any]:
 
 def start(seed: int) -> Any:
     """The key from which PettingZoo's environment draws its first world."""
-    return jax.random.split(jax.random.key(common.seed_number(np_random(seed)[0])))[1]
+    return jax.random.split(jax.random.key(core.seed_number(np_random(seed)[0])))[1]
 
 
 @pytest.mark.parametrize("name", ["team", "transport"])
@@ -73,7 +73,7 @@ def test_it_is_what_jaxmarl_asks_for(name: str):
 @pytest.mark.parametrize("wrap", [False, True])
 def test_it_flies_as_pettingzoos_and_the_brax_environment(team: Config, env: FollowersMultiAgentEnv, wrap: bool):
     """Bit for bit, with and without JaxMARL's own reset at an end, until that end."""
-    parallel, program = FollowersParallelEnv(config=team), compiled_program(team, "newton-euler")
+    parallel, program = FollowersParallelEnv(config=team), core.program(team, "newton-euler")
     step = env.step if wrap else jax.jit(env.step_env)
     shown, _ = parallel.reset(seed=7)
     seen, state = env.reset(start(7))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command_line import call
 from onboard_bench import compilers, needs_gcc
+from tables import weekly
 
 from mjxball.errors import InputError
 from mjxball.export import in_team, main
@@ -125,11 +126,10 @@ def assert_leaves_no_trace(place: Path, compiler: Sequence[str] = ("gcc", "-O1")
     return calm
 
 
-@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize(
     "name",
-    ["balance", "flight", "paper", "robust", "universal"],
+    ["balance", "flight", "universal", *weekly("paper", "robust")],
 )
 @pytest.mark.parametrize("int8", [False, True])
 def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tmp_path: Path):
@@ -139,7 +139,6 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tm
     assert_leaves_no_trace(tmp_path)
 
 
-@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("int8", [False, True])
 def test_compilers_that_are_told_of_finite_numbers_only_remove_no_guard(int8: bool, tmp_path: Path):

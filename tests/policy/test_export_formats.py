@@ -15,6 +15,7 @@ import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
 from onboard_bench import needs_gcc
+from tables import weekly
 
 from mjxball import __version__
 from mjxball.cli import plant_setup
@@ -216,7 +217,7 @@ def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("real", ["float", "double"])
+@pytest.mark.parametrize("real", ["float", *weekly("double")])
 def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_path: Path):
     dtype = np.float32 if real == "float" else np.float64
     flight = flown(contents, dtype)
@@ -315,6 +316,7 @@ def test_a_policy_that_was_told_its_team_flies_as_one_that_joined(tmp_path: Path
     assert told.card["team"]["mount_angle"] == pytest.approx(np.arctan2(-mount[1], -mount[0]))
 
 
+@pytest.mark.slow
 def test_a_missing_package_is_named_with_its_extra(saved: Path):
     script = "import sys; sys.modules['onnx'] = None; from mjxball.export import main; sys.exit(main(sys.argv[1:]))"
     done = run(["-c", script, saved, "out.onnx"], Path(__file__).parents[2])

@@ -240,6 +240,7 @@ class TestCheckpoints:
             self.assert_whole(checkpoints.restore(self.state, lambda text: None, discard=False))
         assert (unfinished / "part").read_bytes() == b"part"
 
+    @pytest.mark.slow
     def test_a_damaged_one_is_one_warning_and_no_traceback(self, tmp_path: Path, written: Path) -> None:
         """TensorStore's threads answer reads after the first failure has ended them; that is nobody's business."""
         script = f"""

@@ -165,6 +165,7 @@ def once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "identify", identify_once)
 
 
+@pytest.mark.release
 def test_hovering_tells_the_force_and_says_that_it_tells_no_more(
     logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:

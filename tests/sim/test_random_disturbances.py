@@ -54,7 +54,7 @@ def test_a_calm_flight_has_a_delay_alone(probability: float, transport: Config) 
     config = with_settings(transport, scenario=levels)
     calm = with_settings(config, scenario={"calm_probability": probability})
     keys = jax.random.split(jax.random.key(0), 1000)
-    usual, found = (jax.vmap(lambda key: RandomDisturbances(c).start(key)[0])(keys) for c in (config, calm))  # noqa: B023
+    usual, found = (jax.jit(jax.vmap(lambda key: RandomDisturbances(c).start(key)[0]))(keys) for c in (config, calm))  # noqa: B023
     still = np.asarray(found.noise) == 0
     for name in ("gust", "force", "drift", "drift_level"):
         quiet = np.asarray(getattr(found, name)).reshape(len(keys), -1) == 0
@@ -83,7 +83,7 @@ def test_delay_is_whole_control_steps(transport: Config, seconds: float, steps: 
 
 def test_gusts_have_their_rms_and_correlation(transport: Config) -> None:
     config = with_settings(transport, scenario={"gust": (0.3, 0.3)})
-    force = jax.vmap(lambda seed: rolled(config, jnp.zeros((60, 18)), seed)[0].force)(jnp.arange(2000))
+    force = jax.jit(jax.vmap(lambda seed: rolled(config, jnp.zeros((60, 18)), seed)[0].force))(jnp.arange(2000))
     assert float(force[:, -1].std()) == pytest.approx(0.3, rel=0.05)
     last, before = np.asarray(force[:, -1]).ravel(), np.asarray(force[:, -26]).ravel()
     assert np.corrcoef(last, before)[0, 1] == pytest.approx(math.exp(-25 * 0.02 / GUST_TIME), abs=0.05)
@@ -92,7 +92,7 @@ def test_gusts_have_their_rms_and_correlation(transport: Config) -> None:
 def test_every_world_draws_its_own_within_the_ranges(transport: Config) -> None:
     config = with_settings(transport, scenario={"noise": (0.5, 1.5), "delay": (0.0, 0.04), "gust": (0.1, 0.3)})
     disturbances = RandomDisturbances(config)
-    drawn = jax.vmap(lambda key: disturbances.start(key)[0])(jax.random.split(jax.random.key(1), 500))
+    drawn = jax.jit(jax.vmap(lambda key: disturbances.start(key)[0]))(jax.random.split(jax.random.key(1), 500))
     for values, low, high in ((drawn.noise, 0.5, 1.5), (drawn.gust, 0.1, 0.3)):
         assert low <= float(values.min()) < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < float(values.max()) <= high
@@ -191,7 +191,7 @@ def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> 
     assert load.cg_path.shape == (400, 16)
     assert float(jnp.abs(load.cg_path).max()) <= 1.0
     times = jnp.linspace(0.0, 60.0, 400)
-    offsets = jax.vmap(lambda time: motion.sine_or_waypoints(jnp.full(400, time), load).offset)(times)
+    offsets = jax.jit(jax.vmap(lambda time: motion.sine_or_waypoints(jnp.full(400, time), load).offset))(times)
     assert bool((jnp.abs(offsets).max(axis=0) <= load.cg_amplitude * (1 + 1e-5)).all())
 
 
@@ -201,7 +201,7 @@ def test_no_world_is_drawn_whose_thrust_nobody_could_trim() -> None:
     config = with_settings(preset("transport"), scenario=varied)
     env = TransportEnv(config, "newton-euler")
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 2000)).pipeline_state.load
-    assert float(jax.vmap(env._resets.trimmed)(load).min()) > -1e-3
+    assert float(jax.jit(jax.vmap(env._resets.trimmed))(load).min()) > -1e-3
     # The follower's own rotors keep most of their range; a leader that lifts too much or too little does not.
     leader, follower = load.thrust_scale.T
     assert float(follower.min()) < 0.83

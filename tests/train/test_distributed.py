@@ -65,11 +65,11 @@ def checkpoints(run: Path) -> list[int]:
     return sorted(int(path.name) for path in place.iterdir() if path.name.isdigit()) if place.is_dir() else []
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None:
     """Two members, one on each process; long after every checkpoint that the test waits for, the run goes on."""
     run, cache = tmp_path / "run", tmp_path / "cache"
-    long = ["--sac.total_steps", "400000", "--sac.num_evaluations", "8"]
+    long = ["--sac.total_steps", "400000", "--sac.num_evaluations", "40"]
     children = launch([*SMALL, "--seeds", "2", *long, "--out", str(run)], cache)
     try:
         deadline = time.monotonic() + LIMIT

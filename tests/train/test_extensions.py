@@ -98,6 +98,7 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # two programs: XLA may fuse them differently
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sac", "ppo"])
 def test_an_episode_that_ends_early_has_its_own_return(name: str, small: Config) -> None:
     """An environment that earns 1 a step and ends after 7: not the 60 of an episode of the time limit."""
@@ -121,6 +122,7 @@ def test_a_reward_of_the_users_own_replaces_ours() -> None:
     assert (env.input_mask, env.observation_size) == (env.env.input_mask, env.env.observation_size)
 
 
+@pytest.mark.slow
 def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
     config = with_plant(preset("lost"), "team6")
     for reward in (lambda _, action, after: -after.metrics["error"], lambda _, action, after: action[..., 0] - 1.0):
@@ -133,6 +135,7 @@ def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
         make_env(Extensions(reward=lambda _, a, after: a[..., :3]), config, "newton-euler")
 
 
+@pytest.mark.slow
 def test_a_run_on_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     flags = [word for name, value in SMALL.items() for word in (f"--sac.{name}", str(value).strip("() "))]

@@ -47,6 +47,7 @@ def trained(key: jax.Array) -> jax.Array:
     return ravel_pytree(jax.tree.leaves(policy))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["cuda", "nonsense"])
 def test_an_absent_device_is_bad_input(tmp_path: Path, platform: str) -> None:
     """Exit code 1 would say that training diverged, or that a policy misses its bounds."""

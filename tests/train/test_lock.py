@@ -62,6 +62,7 @@ def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder
     assert f"process {holder.pid}" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_lock_ends_with_its_process_however_that_ends(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
     run = tmp_path / "run"
     holder.send_signal(signal.SIGKILL)

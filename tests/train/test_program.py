@@ -14,6 +14,7 @@ from mjxball import config as configs
 from mjxball.train import program as programs
 from mjxball.train.program import Program, TrainState
 
+pytestmark = pytest.mark.slow  # trainings
 WORLDS = 128
 
 
@@ -56,7 +57,6 @@ def assert_identical(first: Any, second: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, raw(first), raw(second))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", configs.PRESETS)
 def test_a_training_state_has_no_array_without_elements(name: str) -> None:
     """Over several GPUs XLA's partitioner ends the process by a segfault on one."""
@@ -197,7 +197,6 @@ def test_time_limits_are_bootstrapped(compiled, prefilled):
     assert (ending.next_observation != np.asarray(ending.after.envs.obs)).any(axis=1).all()
 
 
-@pytest.mark.slow
 def test_short_training_improves_the_evaluation(compiled):
     state, *_ = compiled.advance(compiled.create(jax.random.key(0)), programs.warmup(100))
     before = evaluated_return(compiled, state)

@@ -60,6 +60,7 @@ def row(steps: int) -> dict[str, float]:
     return {"steps": steps, "seconds": steps / 100, "rate": 8.0, "episode_return": -float(steps)}
 
 
+@pytest.mark.slow
 def test_after_a_kill_and_a_resume_every_point_stands_once(tmp_path: Path) -> None:
     """Checkpoint at 200 steps, rows to 400, killed, resumed: 300 and 400 come again, with other values."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"

@@ -114,6 +114,7 @@ def test_limits_are_read_as_the_kernel_writes_them(tmp_path: Path, monkeypatch: 
     assert requirements._left_of_group() == float("inf")
 
 
+@pytest.mark.slow
 def test_a_narrow_address_space_is_refused_at_once(tmp_path: Path) -> None:
     """Below it JAX's threads cannot be made: it waits for ever, or aborts."""
     for command in (["train.py"], ["eval.py", "--followers", "copy"]):

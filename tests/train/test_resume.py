@@ -137,6 +137,7 @@ def test_compilation_cache_is_filled(whole: Path) -> None:
     assert any(path.name.startswith("jit_collect") for path in Path(os.environ["MJXBALL_CACHE"]).iterdir())
 
 
+@pytest.mark.slow
 def test_the_source_hash_covers_what_the_training_program_imports() -> None:
     code = (
         "import sys, mjxball.train.program\n"

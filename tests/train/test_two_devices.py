@@ -51,8 +51,10 @@ for algorithm in ALGORITHMS:
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", TRAINING_ENGINES)
+@pytest.mark.parametrize(
+    "engine",
+    [pytest.param(one, marks=getattr(pytest.mark, "release" if one == "mjx" else "slow")) for one in TRAINING_ENGINES],
+)
 def test_every_algorithm_trains_two_members_on_two_devices(engine: str) -> None:
     """PPO ended the process in XLA's partitioner, exit code 134."""
     flags = f"{HASTY} --xla_force_host_platform_device_count=2"

@@ -238,7 +238,6 @@ def test_the_leaders_integral_is_bounded():
     assert bench.phases == [Phase.FLY] * 2
 
 
-@pytest.mark.slow
 @needs_gcc
 def test_compilers_that_are_told_of_finite_numbers_only_remove_no_check(monkeypatch: pytest.MonkeyPatch):
     """All of this file that is about wild numbers, for -Ofast and the like."""

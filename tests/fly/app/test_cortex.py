@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_line import call
 from onboard_bench import Bench, cores_of, needs_gcc, policy_of
+from tables import weekly
 
 import onboard as benchmark
 from mjxball.control import rotations
@@ -36,9 +37,8 @@ FIRMWARE = (  # its Kbuild's, release 2026.08: gcc's dialect has functions of it
 )
 
 
-@pytest.mark.slow
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand", "universal", "recurrent flight --int8"])
+@pytest.mark.parametrize("name", ["flight --int8", "universal", *weekly("flight", "stand", "recurrent flight --int8")])
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
     policy, *more = name.removesuffix(" --int8"), *(["--int8"] if name.endswith("--int8") else [])
     save_file(tmp_path / "policy.npz", policy_of(policy))
@@ -112,7 +112,7 @@ int main(void) {
 
 @pytest.mark.slow
 @needs_arm
-@pytest.mark.parametrize("name", ["flight", "universal", "recurrent flight"])
+@pytest.mark.parametrize("name", ["recurrent flight", *weekly("flight", "universal")])
 def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
     """Both apps over take-off, motion of the pair, landing and a fence that is left, whose inputs were recorded."""
     policy = policy_of(name)

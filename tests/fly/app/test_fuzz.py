@@ -24,7 +24,6 @@ FAULTS = (
 )
 
 
-@pytest.mark.slow
 @needs_gcc
 def test_nothing_makes_an_app_command_what_it_must_not():
     """No report of the sanitizers, no output outside the limits; and nearly everything was reached on the way."""
