@@ -4,7 +4,7 @@
 
 RAPTOR (Eschmann, Albani and Loianno 2025, arXiv 2509.11481) flies any single quadrotor to a point: a recurrent network
 that answers to position, attitude, velocities and its own last command with four rotor commands, at 100 Hz. Here one
-flies each drone to its own place on the rig at the goal; `eval.py --benchmark` has no place for that, as its followers
+flies each drone to its own place on the rig at the goal; `eval.py bench` has no place for that, as its followers
 command an attitude and its leader is a PID. The follower measures what every follower measures, with the same noise and
 delay; the leader, like every leader, knows the truth. Rotors stand between the body axes, as RAPTOR expects. A command
 u in [-1, 1] is the rotor force F_max (u + 1) / 2, and an error of position enters no longer than 0.5 m: of squared or

@@ -121,7 +121,7 @@ WORKS = {
         "mjxball-train --help",
         "mjxball-eval balance",
         "mjxball-eval universal --plant team3 --seconds 1",
-        "mjxball-eval --benchmark balance --tracks pair --out entry.json",
+        "mjxball-eval bench balance --tracks pair --out entry.json",
         "python -m mjxball.view balance --seconds 2 --out flight.html",
     ],
     "fly": [FLIGHT, *(f"python -m mjxfly.log flight.jsonl flight.{kind}" for kind in ("mcap", "parquet"))],

@@ -1,4 +1,4 @@
-"""The paper's figures from our own flights: reward, adaptive, speeds, masses, stand (`eval.py --figures`)."""
+"""The paper's figures from our own flights: reward, adaptive, speeds, masses, stand (`eval.py figures`)."""
 
 from __future__ import annotations
 
@@ -36,16 +36,6 @@ LETTERS = {"font.size": 8, "axes.titlesize": 8.5}  # [pt], on a screen
 FOLLOWING = 3.0  # [s], of errors that swing fast
 SWING = 0.01  # [m] on either side of the goal
 LINEAR = 10.0  # returns nearer to 0 are drawn on a linear scale, the others on a logarithmic one
-
-
-def find_figures(names: Sequence[str]) -> list[str]:
-    """The figures called `names` in the paper's order, all of them for 'all'; InputError for an unknown one."""
-    unknown = [name for name in names if name not in (*NAMES, "all")]
-    if unknown:
-        raise InputError(f"unknown figure {unknown[0]!r}; there are all, {', '.join(NAMES)}")
-    if not names:
-        raise InputError(f"--figures takes a name: all, {', '.join(NAMES)}")
-    return [name for name in NAMES if name in names or "all" in names]
 
 
 def on_stand(policy: Policy) -> bool:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.errors import InputError
 from mjxball.evaluate.team_suites import TEAM_SUITES
 from mjxball.evaluate.variants import Suite, Variant
 from mjxball.sim.disturbances import Disturbance
@@ -159,14 +158,6 @@ PAIR_SUITES: tuple[Suite, ...] = (
 )
 SUITES = (*PAIR_SUITES, *TEAM_SUITES)
 BY_NAME = {suite.name: suite for suite in SUITES}
-
-
-def find_suites(names: list[str]) -> list[Suite]:
-    """The suites called `names`, all of them for 'all'; InputError for an unknown one."""
-    unknown = [name for name in names if name not in BY_NAME and name != "all"]
-    if unknown:
-        raise InputError(f"unknown suite {unknown[0]!r}; there are all, {', '.join(BY_NAME)}")
-    return list(SUITES) if "all" in names else [BY_NAME[name] for name in dict.fromkeys(names)]
 
 
 def list_suites() -> str:
