@@ -28,9 +28,10 @@ import numpy as np
 
 from mjxball import cli
 from mjxball.bench import NAME, VERSION
-from mjxball.bench.entry import table
-from mjxball.bench.score import CONDITIONS, bars, numbers, summary, worlds_of
-from mjxball.bench.tracks import TRACKS, World
+from mjxball.bench.entry import CONDITIONS, table
+from mjxball.bench.references import bars
+from mjxball.bench.success import are_met, summary
+from mjxball.bench.tracks import TRACKS, World, worlds_of
 from mjxball.config import Config
 from mjxball.control import observation, rotations
 from mjxball.errors import InputError
@@ -65,9 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for track in PAIRS:
         (world,) = worlds_of(track, options.draw)
         flown = fly(world, Raptor())
-        reached = np.array([numbers(one) for one in flown])
-        met = [bool(good) for good in (reached <= bars(track, options.draw, 0)).all(axis=1)]
-        met = [good and not one.failed for good, one in zip(met, flown, strict=True)]
+        met = are_met(flown, bars(track, options.draw, 0))
         # There is no attitude command whose change could be measured.
         found[track] = {
             name: {**summary(flown[row::2], met[row::2]), "command_change": None} for row, name in enumerate(CONDITIONS)

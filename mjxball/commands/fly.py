@@ -11,13 +11,13 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.baselines import BASELINES
+from mjxball.bench.report import write_report
+from mjxball.bench.scores import scores_of
 from mjxball.commands.followers import Named, add_flight, add_followers, add_policies, load, named, refuse_same_names
 from mjxball.commands.scenarios import native_scenarios, scenarios_of, setup_of
 from mjxball.errors import InputError
-from mjxball.evaluate.benchmark import scores_of
 from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant
-from mjxball.evaluate.report import write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
 from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.files import write_whole

@@ -48,7 +48,7 @@ class Named:
 
     def made(self, config: Config, every: Sequence[str]) -> list[Follower]:
         """Those that are no policies, for the plant of `config`; `every` one of these names if none was asked for."""
-        return [maker(name)(config) for name in dict.fromkeys(self.names if self.asked else every)]
+        return [_maker(name)(config) for name in dict.fromkeys(self.names if self.asked else every)]
 
 
 def named(options: argparse.Namespace) -> Named:
@@ -57,13 +57,12 @@ def named(options: argparse.Namespace) -> Named:
     files = [*options.policies, *(Path(name) for name in options.followers if name.endswith(".npz"))]
     names = [name for name in options.followers if not name.endswith(".npz")]
     for name in names:
-        maker(name)
+        _maker(name)
     asked = bool(files or names)
     return Named(names, files if asked else shipped_policies(), asked)
 
 
-def maker(name: str) -> Make:
-    """What makes the follower `name`, not a policy, for a plant."""
+def _maker(name: str) -> Make:
     return find_follower(name, "--followers")[1]
 
 

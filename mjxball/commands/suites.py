@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 from pathlib import Path
 
 from mjxball import cli
 from mjxball.baselines import SUITE_BASELINES
+from mjxball.bench.report import write_report
+from mjxball.bench.scores import run_benchmark, text_table
+from mjxball.bench.suites import BY_NAME, list_suites
 from mjxball.commands.followers import (
     add_flight,
     add_followers,
     add_policies,
     clock,
     load,
-    maker,
     named,
     refuse_same_names,
 )
-from mjxball.config import Config, preset
-from mjxball.control.followers import Follower
+from mjxball.config import preset
 from mjxball.errors import InputError
-from mjxball.evaluate.benchmark import run_benchmark, text_table
-from mjxball.evaluate.policies import group_by_plant, load_policy
-from mjxball.evaluate.report import write_report
-from mjxball.evaluate.suites import BY_NAME, list_suites
+from mjxball.evaluate.policies import group_by_plant
 from mjxball.files import write_whole
 from mjxball.train.run_directory import versions
 
@@ -56,35 +53,17 @@ def run(options: argparse.Namespace, command: str) -> int:
         cli.output_file(options.json, ".json")
     setup, chosen, who = preset("paper"), [BY_NAME[name] for name in dict.fromkeys(options.only)], named(options)
     paths, others = (who.paths, []) if options.force else group_by_plant(who.paths)
-    teams = [variant for suite in chosen for variant in suite.variants if variant.team]
-    if others and who.asked and not teams:
-        raise InputError(f"these suites fly the paper's plant, and {others[0][1][0]} was made for another")
-    elsewhere = [path for _, files in others for path in files]
+    if others and who.asked:
+        raise InputError(f"suites fly the paper's plant, and {others[0][1][0]} was made for another")
     longest = max(variant.scenario.seconds for suite in chosen for variant in suite.variants)
     policies = load(paths, lambda path: setup, options.force, seconds=longest)
-    one_plant = len(teams) < sum(len(suite.variants) for suite in chosen)
-    followers = [*(who.made(setup, SUITE_BASELINES) if one_plant else []), *policies]
-    refuse_same_names([*(follower.name for follower in followers), *(path.stem for path in elsewhere)])
-
-    def team_followers(known: Config) -> list[Follower]:
-        """Whoever flies this team: baselines, and policies that were made for such."""
-        found: list[Follower] = []
-        for name in dict.fromkeys(who.names if who.asked else [*SUITE_BASELINES, "lqg-known-failures"]):
-            with contextlib.suppress(InputError):
-                found.append(maker(name)(known))
-        for path in (*paths, *elsewhere):
-            with contextlib.suppress(InputError):
-                found.append(load_policy(path, known))
-        return found
-
-    scores = run_benchmark(setup, followers, chosen, options.num_seeds, options.physics, clock(), team_followers)
-    if not scores:
-        raise InputError("none of these followers flies the teams of these suites")
+    followers = [*who.made(setup, SUITE_BASELINES), *policies]
+    refuse_same_names([follower.name for follower in followers])
+    scores = run_benchmark(setup, followers, chosen, options.num_seeds, options.physics, clock())
     print(text_table(scores, chosen))
     if options.json:
         write_whole(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
-        plant = chosen[0].variants[0].nominal(setup).plant
-        write_report(options.out, plant, scores, chosen, policies, command, versions())
+        write_report(options.out, setup.plant, scores, chosen, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")
     return 0

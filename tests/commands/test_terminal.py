@@ -14,10 +14,10 @@ from command_line import REPOSITORY, environment, script, tiny
 from pseudo_terminal import on_terminal
 
 from mjxball import terminal
-from mjxball.evaluate.benchmark import Score, text_table
+from mjxball.bench.scores import Score, text_table
+from mjxball.bench.suites import BY_NAME
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.results import metric_text
-from mjxball.evaluate.suites import BY_NAME
 from mjxball.terminal import fitted, folded, table
 
 WIDTHS = (40, 80, 100, 130)

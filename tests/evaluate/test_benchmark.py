@@ -13,13 +13,13 @@ from command_line import call
 from conftest import opened
 
 from mjxball.baselines import make_baseline
+from mjxball.bench import report as report_page
+from mjxball.bench import suites
+from mjxball.bench.report import compare, verdict
+from mjxball.bench.scores import Score, bootstrap, by_variant, run_benchmark, wins
+from mjxball.bench.suites import Suite
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.config import preset
-from mjxball.evaluate import report as report_page
-from mjxball.evaluate import suites
-from mjxball.evaluate.benchmark import Score, bootstrap, by_variant, run_benchmark, wins
-from mjxball.evaluate.report import compare, verdict
-from mjxball.evaluate.variants import Suite
 from mjxball.sim.scenario import check_scenario
 from seeds import FLIGHTS, read_levels
 
@@ -49,7 +49,7 @@ def test_every_variant_is_sound_for_every_seed() -> None:
         assert len({variant.label for variant in suite.variants}) == len(suite.variants)
         for variant in suite.variants:
             for seed in range(2):
-                check_scenario(variant.config(variant.nominal(CONFIG), seed), variant.seeded(seed))
+                check_scenario(variant.config(CONFIG, seed), variant.seeded(seed))
 
 
 def test_seeds_are_reproducible_and_differ() -> None:
@@ -214,7 +214,7 @@ def test_report_sorts_and_filters(browser, report: Path) -> None:
 @pytest.mark.slow
 def test_report_says_how_it_was_made(report: Path) -> None:
     text = (report / "report.html").read_text()
-    assert "python eval.py --followers copy adaptive" in text
+    assert "python eval.py suites --followers copy adaptive" in text
     assert "card of <b>transport</b>" in text
     assert "image/webp;base64" in text or "No picture: MuJoCo" in text
 
@@ -223,7 +223,6 @@ def test_the_frozen_levels_are_flights_of_the_pair() -> None:
     levels = [level for suite in read_levels() for level in suite.variants]
     assert len(levels) == 80
     for level in levels:
-        assert level.nominal(CONFIG) is CONFIG
         for seed in range(FLIGHTS):
             config = level.config(CONFIG, seed)
             check_scenario(config, level.seeded(seed))
