@@ -28,6 +28,7 @@ from typing import Any
 from batch import Batch
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
+from mjxball.bench.success import PEAK, later
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
@@ -95,9 +96,9 @@ def feasible(config: Config) -> list[Cell]:
 def wanted(adaptive: dict[str, float], lqg: dict[str, float]) -> dict[str, float]:
     """The largest numbers with which a cell is won."""
     return {
-        "peak": adaptive["peak"] + 0.003,
+        "peak": adaptive["peak"] + PEAK,
         "overshoot": adaptive["overshoot"],
-        "settling": lqg["settling"] + max(0.1, 0.1 * lqg["settling"]),
+        "settling": float(later(lqg["settling"])),
         "rmse": lqg["rmse"] + max(0.005, 0.1 * lqg["rmse"]),
     }
 

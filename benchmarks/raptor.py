@@ -4,7 +4,7 @@
 
 RAPTOR (Eschmann, Albani and Loianno 2025, arXiv 2509.11481) flies any single quadrotor to a point: a recurrent network
 that answers to position, attitude, velocities and its own last command with four rotor commands, at 100 Hz. Here one
-flies each drone to its own place on the rig at the goal; `eval.py --benchmark` has no place for that, as its followers
+flies each drone to its own place on the rig at the goal; `eval.py bench` has no place for that, as its followers
 command an attitude and its leader is a PID. The follower measures what every follower measures, with the same noise and
 delay; the leader, like every leader, knows the truth. Rotors stand between the body axes, as RAPTOR expects. A command
 u in [-1, 1] is the rotor force F_max (u + 1) / 2, and an error of position enters no longer than 0.5 m: of squared or
@@ -28,9 +28,10 @@ import numpy as np
 
 from mjxball import cli
 from mjxball.bench import NAME, VERSION
-from mjxball.bench.entry import table
-from mjxball.bench.score import CONDITIONS, bars, numbers, summary, worlds_of
-from mjxball.bench.tracks import TRACKS, World
+from mjxball.bench.entry import CONDITIONS, table
+from mjxball.bench.references import bars
+from mjxball.bench.success import are_met, summary
+from mjxball.bench.tracks import TRACKS, World, worlds_of
 from mjxball.config import Config
 from mjxball.control import observation, rotations
 from mjxball.errors import InputError
@@ -65,9 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for track in PAIRS:
         (world,) = worlds_of(track, options.draw)
         flown = fly(world, Raptor())
-        reached = np.array([numbers(one) for one in flown])
-        met = [bool(good) for good in (reached <= bars(track, options.draw, 0)).all(axis=1)]
-        met = [good and not one.failed for good, one in zip(met, flown, strict=True)]
+        met = are_met(flown, bars(track, options.draw, 0))
         # There is no attitude command whose change could be measured.
         found[track] = {
             name: {**summary(flown[row::2], met[row::2]), "command_change": None} for row, name in enumerate(CONDITIONS)

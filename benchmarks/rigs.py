@@ -28,6 +28,7 @@ import numpy as np
 from harness import Row, arguments, say, table, write
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
+from mjxball.bench.tracks import RIG_LENGTH
 from mjxball.cli import run_command
 from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Copy, Law
@@ -39,7 +40,7 @@ from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_c
 from random_rigs import AnyRigLaw, Flown, fly, rig_laws
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
-LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]
+LATER, MORE = 1.25, 0.005  # the bar: settling, peak [m] of a rig of the pair's length
 KNOWING = ("lqg-known-rig", "lqg-slow-known-rig")
 PAIR_LOAD = 0.2  # [kg]
 SHARES = ("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner")
@@ -73,7 +74,7 @@ def _adaptive(config: Config) -> Law:
     """With mass adaptation, and limits of its estimates that grow with the rig as they are for the pair."""
     law, plant = Adaptive(config, adapts_mass=True), config.plant
     weight = plant.object_mass / PAIR_LOAD
-    length = max(math.hypot(*drone.mount) for drone in plant.drones) / LENGTH
+    length = max(math.hypot(*drone.mount) for drone in plant.drones) / RIG_LENGTH
     law._estimate_limits = tuple(limit * max(1.0, weight * length) for limit in law._estimate_limits)
     law._mass_limit *= max(1.0, weight)
     return law
@@ -129,7 +130,7 @@ def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) ->
         part: np.array([np.median(getattr(one, part)(period), axis=1) for one in knowing])
         for part in ("settling", "peak")
     }
-    more = MORE * np.maximum(rigs.length / LENGTH, 1.0)
+    more = MORE * np.maximum(rigs.length / RIG_LENGTH, 1.0)
     best, smallest = (theirs[part].min(axis=0) for part in ("settling", "peak"))
     soon = (settling <= LATER * best) | np.isinf(best)
     small = (peak <= smallest + more) | np.isinf(smallest)

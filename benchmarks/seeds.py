@@ -41,14 +41,14 @@ from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
 from mjxball.arrays import Array
 from mjxball.baselines import LAWS, make_baseline
+from mjxball.bench.scores import by_variant, run_benchmark
+from mjxball.bench.suites import Suite, Variant
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.network import Network
 from mjxball.errors import InputError
-from mjxball.evaluate.benchmark import by_variant, run_benchmark
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.variants import Suite, Variant
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.inference import NetworkLaw

@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mjxball.bench.entry import cells, read_entry
-from mjxball.bench.score import CONDITIONS
+from mjxball.bench.entry import CONDITIONS, cells, read_entry
 from mjxball.bench.tracks import TRACKS
 from mjxball.cli import run_command
 from mjxball.errors import InputError

@@ -67,7 +67,7 @@ def flight(out: Path) -> None:
 
 
 def crazyflie_stand(out: Path) -> None:
-    """Archive, page crazyflie: `python eval.py --figures stand`."""
+    """Archive, page crazyflie: `python eval.py figures --only stand --out figures`."""
     policy = Policy.load(shipped_policy("stand"))
     (out / "crazyflie-stand.svg").write_bytes(draw_figure("stand", [policy], "newton-euler").picture)
 

@@ -7,6 +7,7 @@ import atexit
 import contextlib
 import difflib
 import gc
+import itertools
 import os
 import re
 import signal
@@ -114,6 +115,20 @@ class Formatter(argparse.HelpFormatter):
         return "\n".join(lines)
 
 
+class Command(Parser):
+    """The parser of one command of a program, behind `add_subparsers`: it names itself what it does not know."""
+
+    def __init__(self, **given: Any):
+        super().__init__(allow_abbrev=False, formatter_class=Formatter, **given)
+
+    def parse_known_args(self, *given: Any, **named: Any) -> Any:
+        """As `argparse` does; what is left is refused here, where the flags are known."""
+        found, left = super().parse_known_args(*given, **named)
+        if left:
+            self.error(f"unrecognized arguments: {' '.join(left)}")
+        return found, left
+
+
 class Help(argparse.Action):
     """`--help` prints the common flags, `--help all` every one; `--help TOPIC` is the program's own.
 
@@ -152,7 +167,10 @@ class Completion(argparse.Action):
             import shtab
         except ModuleNotFoundError:
             parser.error("shtab is not installed; pip install shtab")
-        for action in parser._actions:
+        parts = [
+            action.choices.values() for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+        ]
+        for action in (action for one in (parser, *itertools.chain(*parts)) for action in one._actions):
             action.choices = getattr(action, "suggested", action.choices)
             named = action.option_strings or action.choices
             if getattr(action.type, "__name__", "") in ("Path", "policy_path") or not named:

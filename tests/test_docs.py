@@ -225,9 +225,9 @@ def test_commands_parse(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_reader_of_commands() -> None:
-    block = "python train.py paper --seed 3  # why\n.venv/bin/python eval.py \\\n --list\nls"
+    block = "python train.py paper --seed 3  # why\n.venv/bin/python eval.py \\\n bench\nls"
     text = f"```bash\n{block}\n```\n`python -m mjxfly\nx.npz`, `python -m mjxfly`"
-    assert list(shown(text)) == [["train.py", "paper", "--seed", "3"], ["eval.py", "--list"], ["mjxfly", "x.npz"]]
+    assert list(shown(text)) == [["train.py", "paper", "--seed", "3"], ["eval.py", "bench"], ["mjxfly", "x.npz"]]
 
 
 def test_a_flag_that_does_not_exist_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,7 +59,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def parts() -> set[str]:
     """What pages are made of, the plants that have a name, and the C of the apps on board."""
-    places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "evaluate/templates", "config/plants"))
+    places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "bench/templates", "config/plants"))
     paths = [path for place in places for path in place.iterdir()]
     paths += (path for path in (REPOSITORY / "mjxfly").rglob("*.[chj]*") if path.suffix in (".c", ".h", ".js"))
     return {str(path.relative_to(REPOSITORY)) for path in paths}
@@ -121,7 +121,7 @@ WORKS = {
         "mjxball-train --help",
         "mjxball-eval balance",
         "mjxball-eval universal --plant team3 --seconds 1",
-        "mjxball-eval --benchmark balance --tracks pair --out entry.json",
+        "mjxball-eval bench balance --tracks pair --out entry.json",
         "python -m mjxball.view balance --seconds 2 --out flight.html",
     ],
     "fly": [FLIGHT, *(f"python -m mjxfly.log flight.jsonl flight.{kind}" for kind in ("mcap", "parquet"))],

@@ -26,15 +26,15 @@ SHORTER = {
     "train.py balance": GRADIENT,
     "train.py --distributed": TRAINING,
     "train.py --plant": TRAINING,
-    "--benchmark": "--tracks pair",
-    "--figures": "--figures speeds --physics newton-euler",
+    "eval.py bench": "--tracks pair",
+    "eval.py figures": "--only speeds --physics newton-euler",
     "eval.py policies/universal.npz": "--physics newton-euler",
     "--rehearse": "--seconds 5",
 }
 
 
 # What takes half a minute, and other tests run as well: before a release.
-LONG = ("--algorithm gradient", "--plant team3", "--distributed", "--benchmark", "--rehearse")
+LONG = ("--algorithm gradient", "--plant team3", "--distributed", "eval.py bench", "--rehearse")
 
 
 def shown(found: dict[str, Any], key: str, factor: float, digits: int) -> str:

@@ -43,9 +43,9 @@ def entrant(text: str) -> tuple[str, Make]:
     if text not in LAWS and ":" not in text:
         names = [*(shipped.stem for shipped in shipped_policies()), *(name for name in LAWS if name not in UNRANKED)]
         raise InputError(
-            f"--benchmark takes a file .npz or .onnx, package.module:Class, or one of {', '.join(names)}, not {text!r}"
+            f"the benchmark flies a file .npz or .onnx, module:Class, or one of {', '.join(names)}, not {text!r}"
         )
-    return find_follower(text, "--benchmark")
+    return find_follower(text, "follower")
 
 
 def _loaded(path: Path, config: Config) -> Policy:

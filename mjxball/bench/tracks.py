@@ -5,24 +5,26 @@ A draw is a number; entries of the leaderboard are of draw 0, and any other draw
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjxball.baselines import make_baseline
-from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
 from mjxball.bench import VERSION
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.constants import trim_limit
-from mjxball.control.followers import Baseline
+from mjxball.control.followers import Follower
+from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude, largest_margin
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rigs import draw_rigs, rig_config, unpadded
+from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import CgPath, Scenario
 
+ENGINE = "newton-euler"
 SECONDS = 30.0  # of a flight
 FLIGHTS = 120  # of a track, undisturbed, and as many disturbed
 MARGIN = 0.15  # of the rotors' range that the trim of every load leaves
@@ -38,6 +40,8 @@ RIG_LENGTH = 0.17  # [m] of the pair, for which a bar in metres is meant
 NOISE, DELAY, RIG_DELAY = 1.0, 0.04, 0.02  # level, [s], [s] of random rigs
 THRUST = (0.985, 1.015)  # of the Crazyflies' rotors, over what is asked
 CRAZYFLIE = {"noise": 0.5, "estimator_drift": 1.0, "delay": 0.03, "quantize": True}
+LQGS = ("lqg", "lqg-slow", "lqg-offset-free")  # references: classical followers that know the plant
+RIG_LQGS = ("lqg-known-rig", "lqg-slow-known-rig")  # that know the rig
 Pair = tuple[Scenario, Scenario]  # undisturbed, disturbed
 
 
@@ -47,10 +51,18 @@ class World:
 
     config: Config
     scenarios: tuple[Pair, ...]
-    references: tuple[Callable[[Config], Baseline], ...]
+    references: tuple[str, ...]  # see `mjxball.bench.references`
     # What the references fly where the entrant is told less: undisturbed, disturbed.
     reference_scenarios: tuple[Scenario, ...] = ()
     length: float = 1.0  # factor on bars in metres
+
+    def fly(self, followers: Sequence[Follower], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
+        """Metrics of every flight of every follower, in float64."""
+        flown = simulate_batch(self.config, [(follower, scenarios) for follower in followers], ENGINE)
+        plant, count = self.config.plant, len(scenarios)
+        limit, most = self.config.scenario.termination_distance, rotor_limits(plant, [*scenarios] * len(followers))
+        found = measure_batch(flown, limit, most, plant.leader)
+        return [found[first : first + count] for first in range(0, len(found), count)]
 
 
 @dataclass(frozen=True)
@@ -60,18 +72,6 @@ class Track:
     name: str
     title: str
     worlds: Callable[[int], list[World]]  # of a draw
-
-
-def _knowing(*names: str) -> tuple[Callable[[Config], Baseline], ...]:
-    return tuple(lambda config, name=name: make_baseline(name, config) for name in names)
-
-
-PAIR_REFERENCES = _knowing("lqg", "lqg-slow", "lqg-offset-free")
-TEAM_REFERENCES = _knowing("lqg", "lqg-slow", "lqg-offset-free")
-RIG_REFERENCES = (
-    lambda config: Baseline(KnownRigLqg(config), config),
-    lambda config: Baseline(SlowKnownRigLqg(config), config),
-)
 
 
 def _random(draw: int, track: int) -> np.random.Generator:
@@ -105,11 +105,11 @@ def _pair(draw: int, known: bool) -> list[World]:
         if amplitude <= trim_limit(config.plant, mass, MARGIN, mass if known else BELIEVED):
             scenarios.append(_both(scenario, random))
     if known:
-        return [World(config, tuple(scenarios), PAIR_REFERENCES)]
+        return [World(config, tuple(scenarios), LQGS)]
     blind = tuple(
         (replace(calm, believed_mass=BELIEVED), replace(rough, believed_mass=BELIEVED)) for calm, rough in scenarios
     )
-    return [World(config, blind, PAIR_REFERENCES, tuple(one for pair in scenarios for one in pair))]
+    return [World(config, blind, LQGS, tuple(one for pair in scenarios for one in pair))]
 
 
 def _team(draw: int) -> list[World]:
@@ -138,7 +138,7 @@ def _team(draw: int) -> list[World]:
             )
             if reach > 0:
                 scenarios.append(_both(scenario, random))
-        worlds.append(World(config, tuple(scenarios), TEAM_REFERENCES))
+        worlds.append(World(config, tuple(scenarios), LQGS))
     return worlds
 
 
@@ -165,7 +165,7 @@ def _rigs(draw: int) -> list[World]:
                 )
                 scenarios.append(_both(scenario, random, RIG_DELAY))
             length = max(1.0, float(rigs.length[row]) / RIG_LENGTH)
-            worlds.append(World(config, tuple(scenarios), RIG_REFERENCES, length=length))
+            worlds.append(World(config, tuple(scenarios), RIG_LQGS, length=length))
     return worlds
 
 
@@ -188,7 +188,7 @@ def _crazyflie(draw: int) -> list[World]:
         trims = [largest_margin(config, scenario.mass, side * scenario.amplitude, *known) for side in (-1, 1)]
         if min(trim.margin for trim in trims) >= MARGIN:
             scenarios.append((scenario, replace(scenario, disturbance=rough)))
-    return [World(config, tuple(scenarios), _knowing("lqg"))]
+    return [World(config, tuple(scenarios), LQGS[:1])]
 
 
 TRACKS: dict[str, Track] = {
@@ -201,3 +201,9 @@ TRACKS: dict[str, Track] = {
         Track("crazyflie", "two Crazyflies", _crazyflie),
     )
 }
+
+
+@functools.cache
+def worlds_of(track: str, draw: int) -> list[World]:
+    """The worlds of a track, drawn once."""
+    return TRACKS[track].worlds(draw)

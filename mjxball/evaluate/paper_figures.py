@@ -1,9 +1,9 @@
-"""The paper's figures from our own flights: reward, adaptive, speeds, masses, stand (`eval.py --figures`)."""
+"""The paper's figures from our own flights: reward, adaptive, speeds, masses, stand (`eval.py figures`)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,6 @@ from mjxball.evaluate.plots import Figure, distance, panels, thinned
 from mjxball.evaluate.results import Result, fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.evaluate.stand_figure import draw_stand
-from mjxball.evaluate.suites import BY_NAME
 from mjxball.plotting import (
     INK,
     follower_styles,
@@ -30,22 +29,19 @@ from mjxball.plotting import (
     style,
 )
 from mjxball.policy import Policy
+from mjxball.sim.scenario import Scenario
 
 NAMES = ("reward", "adaptive", "speeds", "masses", "stand")
+SPEEDS = {f"{w:g} rad/s": Scenario(omega=w) for w in (0.31, 0.62, 1.0, 2.0, 3.1)}
+MASSES = {f"{m:g} kg": Scenario(mass=m) for m in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)}
+CHANGES = {
+    f"{', '.join(f'{mass:+g} kg at {time:g} s' for time, mass in changes)}": Scenario(mass_changes=changes)
+    for changes in (((15.0, 0.1),), ((15.0, -0.1),), ((12.0, 0.1), (24.0, -0.1)))
+}
 LETTERS = {"font.size": 8, "axes.titlesize": 8.5}  # [pt], on a screen
 FOLLOWING = 3.0  # [s], of errors that swing fast
 SWING = 0.01  # [m] on either side of the goal
 LINEAR = 10.0  # returns nearer to 0 are drawn on a linear scale, the others on a logarithmic one
-
-
-def find_figures(names: Sequence[str]) -> list[str]:
-    """The figures called `names` in the paper's order, all of them for 'all'; InputError for an unknown one."""
-    unknown = [name for name in names if name not in (*NAMES, "all")]
-    if unknown:
-        raise InputError(f"unknown figure {unknown[0]!r}; there are all, {', '.join(NAMES)}")
-    if not names:
-        raise InputError(f"--figures takes a name: all, {', '.join(NAMES)}")
-    return [name for name in NAMES if name in names or "all" in names]
 
 
 def on_stand(policy: Policy) -> bool:
@@ -166,7 +162,7 @@ def swings(error: np.ndarray) -> int:
 def draw_speeds(policies: Sequence[Policy], physics: str) -> Figure:
     """Five CG speeds: each policy a column, copying the last one."""
     setup = configs.preset("paper")
-    columns = _fly_suite([*policies, make_baseline("copy", setup)], "cg-speed", physics, " rad/s")
+    columns = _fly([*policies, make_baseline("copy", setup)], SPEEDS, physics)
     caption = (
         "Position of O, goal dotted, and its largest distance from there in the next 3 s, for five speeds of the CG: "
         "±0.05 m along the rod, object of 0.2 kg."
@@ -176,7 +172,7 @@ def draw_speeds(policies: Sequence[Policy], physics: str) -> Figure:
 
 def draw_masses(policies: Sequence[Policy], physics: str) -> Figure:
     """Object masses: for each policy a column of known ones and one of changes in flight."""
-    known, changed = (_fly_suite(policies, name, physics) for name in ("mass-known", "mass-change"))
+    known, changed = (_fly(policies, scenarios, physics) for scenarios in (MASSES, CHANGES))
     columns = [pair for both in zip(known, changed, strict=True) for pair in both]
     titles = ("known mass", "mass changes")
     columns = [(f"{name}, {titles[k % 2]}", results) for k, (name, results) in enumerate(columns)]
@@ -191,12 +187,10 @@ def draw_masses(policies: Sequence[Policy], physics: str) -> Figure:
 Column = tuple[str, list[tuple[str, Result]]]  # title, (label, flight)
 
 
-def _fly_suite(followers: Sequence[Any], name: str, physics: str, unit: str = "") -> list[Column]:
-    suite = BY_NAME[name]
-    results = fly_scenarios(configs.preset("paper"), followers, [v.seeded(0) for v in suite.variants], physics)
-    labels = [variant.label + unit for variant in suite.variants]
+def _fly(followers: Sequence[Any], scenarios: Mapping[str, Scenario], physics: str) -> list[Column]:
+    results = fly_scenarios(configs.preset("paper"), followers, [*scenarios.values()], physics)
     count = len(followers)
-    return [(f.name, list(zip(labels, results[k::count], strict=True))) for k, f in enumerate(followers)]
+    return [(f.name, list(zip(scenarios, results[k::count], strict=True))) for k, f in enumerate(followers)]
 
 
 def _variations(

@@ -1,9 +1,8 @@
-"""Figures: SVG text for the report, PNG files of single flights."""
+"""Figures of single flights."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.evaluate.benchmark import Score, Summary
 from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_title, to_json
 from mjxball.files import write_whole
 from mjxball.plotting import (
@@ -22,17 +20,14 @@ from mjxball.plotting import (
     line,
     logarithmic,
     pyplot,
-    rendered,
     save,
     style,
 )
 from mjxball.sim.rollout import Trajectory
 
-POINTS = 240  # of a curve over time
 PAPER_POINTS = 700  # of a curve of the paper's figures
 LEAST_SPAN = 0.01  # of an axis [m], [deg], [m/s2]
 LEAST_ERROR = 1e-3  # of the axis of distances: less is rounding [mm]
-LEAST_PEAK = 1e-4  # of the axis of peaks [m]
 PANELS = (
     ("position", 0, "x [m]"),
     ("position", 1, "y [m]"),
@@ -44,7 +39,6 @@ PANELS = (
     ("command", 2, "vertical command [m/s²]"),
 )
 CG_STYLES = ("-", ":")  # along the line, or along x and y
-NOT_DRAWN = ("stay", "random")  # they would flatten every scale
 
 
 def of_followers(flight: Trajectory, index: int) -> np.ndarray:
@@ -52,103 +46,9 @@ def of_followers(flight: Trajectory, index: int) -> np.ndarray:
     return flight.follower_command.reshape(len(flight.time), -1, 3)[..., index].T
 
 
-def variant_curves(scores: Sequence[Score], axis: str) -> str:
-    """Steady-state peak and settling over the variants of one suite, every follower with its interval."""
-    plt, names = pyplot(), [name for name in dict.fromkeys(s.follower for s in scores) if name not in NOT_DRAWN]
-    variants = list(dict.fromkeys(score.variant for score in scores))
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    looks = follower_styles(names)
-    for panel, (metric, label) in zip(axes, (("peak", "steady-state peak [m]"), ("rmse", "RMSE [m]")), strict=True):
-        for name in names:
-            mine = {score.variant: score.summary(metric) for score in scores if score.follower == name}
-            flown = [mine.get(variant, Summary(math.nan, math.nan, math.nan)) for variant in variants]
-            rows = np.array([[one.median, one.low, one.high] for one in flown])
-            rows[~np.isfinite(rows)] = np.nan
-            panel.plot(range(len(variants)), rows[:, 0], markersize=4, label=name, **looks[name])
-            shade = {"color": looks[name]["color"], "alpha": 0.15, "linewidth": 0}
-            panel.fill_between(range(len(variants)), rows[:, 1], rows[:, 2], **shade)
-        if any(np.isfinite(line.get_ydata()).any() for line in panel.lines):
-            logarithmic(panel)
-            panel.set_ylim(bottom=max(panel.get_ylim()[0], LEAST_PEAK))
-        panel.set_ylabel(label)
-        panel.set_xticks(range(len(variants)), variants, fontsize=8, rotation=15 if max(map(len, variants)) > 9 else 0)
-        panel.set_xlabel(axis)
-        panel.grid()
-    legend_above(figure, axes[:1], 6)
-    return rendered(figure, "svg").decode()
-
-
-def flight_curves(scores: Sequence[Score]) -> str:
-    """One variant's flights of seed 0: x and distance from the goal of the object, and the follower's pitch command."""
-    plt, shown = pyplot(), [score for score in scores if score.follower not in NOT_DRAWN]
-    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(10, 5.8), layout="constrained")
-    looks, first = follower_styles(score.follower for score in scores), scores[0].first.flight
-    rows = np.unique(np.linspace(0, len(first.time) - 1, POINTS).astype(int))
-    axes[0].plot(first.time[rows], first.target[rows, 0], color=INK, linestyle=":", linewidth=1, label="goal")
-    for score in shown:
-        flight, look = score.first.flight, line(looks[score.follower])
-        axes[0].plot(flight.time[rows], flight.position[rows, 0], label=score.follower, **look)
-        axes[1].plot(flight.time[rows], distance(flight)[rows], **look)
-        for pitch in of_followers(flight, 1):
-            axes[2].plot(flight.time[rows], np.degrees(pitch[rows]), **look)
-    if shown:
-        logarithmic(axes[1])
-    for axis, label in zip(axes, ("x [m]", "distance to goal [mm]", "pitch command [deg]"), strict=True):
-        axis.set_ylabel(label)
-        axis.grid()
-        axis.margins(x=0)
-    axes[2].set_xlabel("time [s]")
-    legend_above(figure, axes[:1], 6)
-    return rendered(figure, "svg").decode()
-
-
 def distance(flight: Trajectory) -> np.ndarray:
     """(T,) of O from its goal, for a logarithmic axis [mm]."""
     return np.maximum(1e3 * np.linalg.norm(flight.position - flight.target, axis=-1), LEAST_ERROR)
-
-
-def heat_maps(scores: Sequence[Score]) -> str:
-    """Steady-state peak over (CG speed, object mass), one map for each follower, all on one logarithmic scale."""
-    speeds = sorted({score.first.scenario.omega for score in scores})
-    masses = sorted({score.first.scenario.mass for score in scores})
-    peaks: dict[str, np.ndarray] = {}
-    for score in scores:
-        table = peaks.setdefault(score.follower, np.full((len(masses), len(speeds)), np.nan))
-        place = masses.index(score.first.scenario.mass), speeds.index(score.first.scenario.omega)
-        table[place] = score.summary("peak").median
-    plt = pyplot()
-    from matplotlib.colors import LogNorm
-
-    columns = min(4, len(peaks))
-    rows = math.ceil(len(peaks) / columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(2.9 * columns, 2.5 * rows), squeeze=False, layout="constrained")
-    image = None
-    for axis, (name, table) in zip(axes.flat, peaks.items(), strict=False):
-        shown = np.where(np.isfinite(table), table, np.nan)
-        image = axis.imshow(shown, norm=LogNorm(1e-3, 1.0), cmap="viridis_r", aspect="auto", origin="lower")
-        for (i, j), value in np.ndenumerate(table):
-            text = "failed" if not math.isfinite(value) else f"{1e3 * value:.0f}"
-            dark = math.isfinite(value) and value > 0.05
-            axis.text(
-                j,
-                i,
-                text,
-                ha="center",
-                va="center",
-                fontsize=6,
-                color="white" if dark else "black" if math.isfinite(value) else INK,
-            )
-        axis.set_xticks(range(len(speeds)), [f"{speed:g}" for speed in speeds], fontsize=7)
-        axis.set_yticks(range(len(masses)), [f"{mass:g}" for mass in masses], fontsize=7)
-        axis.set_title(name, fontsize=9)
-    for axis in list(axes.flat)[len(peaks) :]:
-        axis.set_visible(False)
-    for axis in axes[-1]:
-        axis.set_xlabel("CG speed [rad/s]", fontsize=8)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("mass [kg]", fontsize=8)
-    figure.colorbar(image, ax=axes, label="peak [m]", shrink=0.8, format="%g")
-    return rendered(figure, "svg").decode()
 
 
 def draw_flights(

@@ -39,7 +39,7 @@ def read_arrays(name: str, kind: str = "policy file", limit: int = MAX_BYTES) ->
     except InputError as error:
         raise PolicyFileError(str(error)) from None
     if str(name).endswith(".onnx"):
-        raise PolicyFileError(f"{name} is no {kind}; `eval.py --benchmark` alone flies an ONNX model")
+        raise PolicyFileError(f"{name} is no {kind}; `eval.py bench` alone flies an ONNX model")
     if content.count(DIRECTORY_ENTRY) > MAX_ENTRIES:
         raise PolicyFileError(f"{name} is not a {kind}: it has more than {MAX_ENTRIES} entries")
     try:

@@ -15,9 +15,9 @@ import pytest
 from command_line import REPOSITORY, call
 
 from mjxball.baselines import make_baseline
-from mjxball.bench import followers, score
-from mjxball.bench.entry import read_entry, run
-from mjxball.bench.tracks import MARGIN, TRACKS, World
+from mjxball.bench import followers, references, success
+from mjxball.bench.entry import CONDITIONS, read_entry, run
+from mjxball.bench.tracks import MARGIN, TRACKS, World, worlds_of
 from mjxball.cli import run_command
 from mjxball.commands.evaluate import main
 from mjxball.evaluate.metrics import measure
@@ -109,7 +109,7 @@ REFUSED = {
     "gone.npz": "does not exist",
     "gone.onnx": "no file gone.onnx",
     "text.onnx": "is no ONNX model",
-    "lqgg": "--benchmark takes a file",
+    "lqgg": "the benchmark flies a file",
     "oracle": "oracle is not ranked",
     "random": "random is not ranked",
 }
@@ -130,10 +130,10 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return [dataclasses.replace(world, scenarios=tuple(few))]
 
     monkeypatch.setitem(TRACKS, "pair", dataclasses.replace(TRACKS["pair"], worlds=cut))
-    for cached in (score.worlds_of, score.bars):
+    for cached in (worlds_of, references.bars):
         cached.cache_clear()
     yield tmp_path
-    for cached in (score.worlds_of, score.bars):
+    for cached in (worlds_of, references.bars):
         cached.cache_clear()
 
 
@@ -169,7 +169,7 @@ def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str)
     assert call(main, arguments) == 2
     captured = capsys.readouterr()
     *_, last = captured.err.splitlines()
-    assert last.startswith("error: ")
+    assert last.startswith(("error: ", "eval.py "))
     assert said in last
     assert not captured.out
 
@@ -208,12 +208,12 @@ def test_a_flight_is_met_that_is_as_good_as_the_best_reference(monkeypatch: pyte
     for name in names:
         flown = [simulate(config, make_baseline(name, config), one, "newton-euler") for one in pair]
         found[name] = [measure(one, config.scenario.termination_distance) for one in flown]
-    for cached in (score.worlds_of, score.bars):
+    for cached in (worlds_of, references.bars):
         cached.cache_clear()
-    bars = score.bars("pair", 0, 0)
+    bars = references.bars("pair", 0, 0)
     for row in (0, 1):
         peak, settling = (
-            min(one) for one in zip(*(score.numbers(found[name][row])[:2] for name in names), strict=True)
+            min(one) for one in zip(*(success.numbers(found[name][row])[:2] for name in names), strict=True)
         )
         np.testing.assert_allclose(bars[row, :2], (peak + 0.003, max(1.1 * settling, settling + 0.1)))
         overshoot = min(found[name][row].overshoot for name in names)
@@ -223,17 +223,17 @@ def test_a_flight_is_met_that_is_as_good_as_the_best_reference(monkeypatch: pyte
     found["copy"] = [measure(copy, config.scenario.termination_distance)]
     for name, flights in found.items():
         entry = run(name, lambda config, name=name: make_baseline(name, config), ["pair"], 0)
-        good = all(own <= bar for own, bar in zip(score.numbers(flights[0]), bars[0], strict=True))
+        good = all(own <= bar for own, bar in zip(success.numbers(flights[0]), bars[0], strict=True))
         assert entry["tracks"]["pair"]["undisturbed"]["met"] == good
     assert not good  # copy
-    for cached in (score.worlds_of, score.bars):
+    for cached in (worlds_of, references.bars):
         cached.cache_clear()
 
 
 def test_an_onnx_file_of_a_policy_comes_to_what_the_policy_does(short: Path):
     assert export([str(BALANCE), "balance.onnx"]) == 0
     both = [run(*followers.entrant(text), ["pair"], 0)["tracks"] for text in (str(BALANCE), "balance.onnx")]
-    for condition in score.CONDITIONS:
+    for condition in CONDITIONS:
         ours, theirs = (one["pair"][condition] for one in both)
         assert ours["met"] == theirs["met"]
         np.testing.assert_allclose(ours["command_change"], theirs["command_change"], rtol=1e-3)
@@ -241,27 +241,27 @@ def test_an_onnx_file_of_a_policy_comes_to_what_the_policy_does(short: Path):
 
 @pytest.mark.parametrize("name", ["bad:Good", "bad:Law"])
 def test_a_follower_from_outside_gets_an_entry(short: Path, name: str):
-    assert main(["--benchmark", name, "--tracks", "pair", "--draw", "2", "--out", "entry.json"]) == 0
+    assert main(["bench", name, "--tracks", "pair", "--draw", "2", "--out", "entry.json"]) == 0
     entry = json.loads((short / "entry.json").read_text())
     assert (entry["draw"], entry["follower"], list(entry["tracks"])) == (2, name.partition(":")[2], ["pair"])
-    assert entry["command"].startswith("python eval.py --benchmark")
+    assert entry["command"].startswith("python eval.py bench")
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_no_follower_is_refused_and_nothing_written(short: Path, capsys: pytest.CaptureFixture[str], name: str):
-    refused(capsys, ["--benchmark", name, "--tracks", "pair", "--out", "entry.json"], REFUSED[name])
+    refused(capsys, ["bench", name, "--tracks", "pair", "--out", "entry.json"], REFUSED[name])
     assert not (short / "entry.json").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--benchmark", "copy"], "--out FILE.json"),
-        (["--benchmark", "copy", "--out", "report"], "--out FILE.json"),
-        (["--benchmark", "copy", "--out", "e.json", "--tracks", "moon"], "unknown track 'moon'"),
-        (["--benchmark", "copy", "--out", "e.json", "--draw", "-1"], "--draw must not be negative"),
-        (["--benchmark", "copy", "--out", "e.json", "--omega", "1"], "drop --omega"),
-        (["--draw", "1"], "belong to --benchmark"),
+        (["bench", "copy"], "required: --out"),
+        (["bench", "copy", "--out", "report"], "must end in .json"),
+        (["bench", "copy", "--out", "e.json", "--tracks", "moon"], "invalid choice: 'moon'"),
+        (["bench", "copy", "--out", "e.json", "--draw", "-1"], "--draw must not be negative"),
+        (["bench", "copy", "--out", "e.json", "--omega", "1"], "unrecognized arguments: --omega"),
+        (["--draw", "1"], "unrecognized arguments: --draw"),
     ],
 )
 def test_arguments_that_do_not_fit(short: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str):
@@ -304,7 +304,7 @@ def test_an_onnx_file_with_other_inputs_is_refused(
 ):
     kind, observation, command, names = model
     linear("other.onnx", (kind, observation), command, names)
-    refused(capsys, ["--benchmark", "other.onnx", "--tracks", "pair", "--out", "entry.json"], said)
+    refused(capsys, ["bench", "other.onnx", "--tracks", "pair", "--out", "entry.json"], said)
     assert not (short / "entry.json").exists()
 
 
@@ -405,7 +405,7 @@ def test_references_come_to_what_their_entries_say(track: str):
     name = "lqg" if track == "crazyflie" else "lqg-slow"
     entry = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())
     found = run(name, lambda config: make_baseline(name, config), [track], 0)["tracks"][track]
-    for condition in score.CONDITIONS:
+    for condition in CONDITIONS:
         wanted = entry["tracks"][track][condition]
         assert found[condition]["met"] == wanted["met"]
         for name, value in wanted.items():

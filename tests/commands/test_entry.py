@@ -102,7 +102,7 @@ def test_installed_commands_are_completed_by_their_own_name(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxfly", "--version"), ("eval.py", "--list")])
+@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxfly", "--version"), ("eval.py", "bench", "-h")])
 @pytest.mark.parametrize("buffered", [True, False])
 def test_what_cannot_be_printed_is_said(words: tuple[str, ...], buffered: bool) -> None:
     """Nor is a second line said by Python, which tries again as it ends."""

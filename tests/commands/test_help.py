@@ -62,7 +62,8 @@ def test_help_of_fly_ends_with_the_faults_of_the_twin(helped: Helped) -> None:
 @pytest.mark.parametrize("columns", [20, 40, 80, 100, 130])
 def test_no_line_is_longer_than_the_terminal(program: str, columns: int, helped: Helped) -> None:
     """But one long word."""
-    for words in (["--help"], ["--help", "all"])[: 1 + (program != "eval")]:
+    every = [["bench", "--help"], ["figures", "--help"]] if program == "eval" else [["--help", "all"]]
+    for words in (["--help"], *every):
         for line in helped(program, *words, columns=columns).splitlines():
             assert len(line) <= columns or (columns < 40 and len(line.split()) == 1), line
 
@@ -94,24 +95,28 @@ def test_help_of_one_section_and_of_none_that_there_is(helped: Helped) -> None:
 BASH = """
 source {script}
 COMP_WORDS=({words}); COMP_CWORD=$(({count} - 1))
-$(complete -p train.py | sed 's/.*-F \\([^ ]*\\).*/\\1/') train.py "${{COMP_WORDS[COMP_CWORD]}}"
+$(complete -p {program} | sed 's/.*-F \\([^ ]*\\).*/\\1/') {program} "${{COMP_WORDS[COMP_CWORD]}}"
 echo "${{COMPREPLY[@]}}"
 """
 
 
 @pytest.mark.slow
 def test_bash_completes_what_the_script_says(helped: Helped, tmp_path: Path) -> None:
-    script = tmp_path / "completion.sh"
-    script.write_text(helped("train", "--print-completion", "bash"))
+    for name in ("train", "eval"):
+        (tmp_path / name).write_text(helped(name, "--print-completion", "bash"))
 
-    def completed(*words: str) -> list[str]:
-        program = BASH.format(script=script, words=" ".join(["train.py", *words]), count=len(words) + 1)
+    def completed(name: str, *words: str) -> list[str]:
+        given = [f"{name}.py", *words]
+        program = BASH.format(script=tmp_path / name, program=given[0], words=" ".join(given), count=len(given))
         done = subprocess.run(["bash", "--norc", "-c", program], capture_output=True, text=True, check=True)
         return done.stdout.split()
 
-    assert completed("bal") == ["balance"]
-    assert completed("--scenario.cg_w") == ["--scenario.cg_width", "--scenario.cg_waypoint_probability"]
-    assert completed("--physics", "n") == ["newton-euler"]
+    assert completed("train", "bal") == ["balance"]
+    assert completed("train", "--scenario.cg_w") == ["--scenario.cg_width", "--scenario.cg_waypoint_probability"]
+    assert completed("train", "--physics", "n") == ["newton-euler"]
+    assert completed("eval", "--physics", "n") == completed("eval", "fly", "--physics", "n") == ["newton-euler"]
+    assert completed("eval", "fi") == ["figures"]
+    assert completed("eval", "bench", "--tracks", "pair-") == ["pair-unknown"]
     assert "#compdef" in helped("eval", "--print-completion", "zsh")
 
 

@@ -14,10 +14,10 @@ from command_line import REPOSITORY, environment, script, tiny
 from pseudo_terminal import on_terminal
 
 from mjxball import terminal
-from mjxball.evaluate.benchmark import Score, text_table
+from mjxball.bench.scores import Score, text_table
+from mjxball.bench.suites import BY_NAME
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.results import metric_text
-from mjxball.evaluate.suites import find_suites
 from mjxball.terminal import fitted, folded, table
 
 WIDTHS = (40, 80, 100, 130)
@@ -117,7 +117,7 @@ def flight(**values: float | bool | None) -> Metrics:
 
 
 def test_suites_have_units_never_and_a_mark() -> None:
-    suites = find_suites(["cg-speed", "rotor-lag"])
+    suites = [BY_NAME["cg-speed"], BY_NAME["rotor-lag"]]
     flown = {"settled": flight(), "never": flight(settling_time=None), "lost": flight(failed=True)}
     scores = [
         Score(suite.name, variant.label, name, (metrics,), None)

@@ -88,10 +88,10 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("figures")
     arrays, card = load_arrays()
     write_arrays(here / "curved.npz", arrays, {**card, "curve": CURVE})
-    flags = [here / "curved.npz", "--figures", "all", standing(here / "rocked.npz"), "--out", here / "out"]
+    flags = [here / "curved.npz", standing(here / "rocked.npz"), "--out", here / "out"]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(stand_figure, "STAND_START", dataclasses.replace(stand_figure.STAND_START, seconds=22.0))
-        assert call(main, [*FAST, *flags]) == 0
+        assert call(main, ["figures", *flags, *FAST]) == 0
     return here / "out"
 
 
@@ -160,23 +160,15 @@ def test_figures_open_in_a_browser(browser, drawn: Path, width: int) -> None:
 
 
 REFUSED = {
-    "unknown figure": (["--figures", "speed"], "unknown figure 'speed'; there are all, reward"),
-    "no figure": (["--figures", TRANSPORT], "--figures takes a name"),
-    "suite": (["--figures", "all", "--families", "delay"], "drop --suite"),
-    "seeds": (["--figures", "all", "--seeds", 2], "drop --num-seeds"),
-    "check": (["--figures", "all", "--check"], "drop --check"),
-    "followers": (["--figures", "all", "--followers", "lqg"], "drop --followers"),
-    "style": (["--suite", "gusts", "--style", "paper"], "--style belongs to figures"),
-    "scenario": (["--figures", "all", "--omega", 1], "drop --omega"),
-    "mass change": (["--figures", "all", "--mass-change", "1:0.1"], "drop --mass-change"),
-    "stiffness": (["--figures", "all", "--wn-pitch", 5], "drop --wn-pitch"),
-    "json": (["--figures", "all", "--json", "new.json"], "drop --json"),
-    "no such policy": (["nothing.npz", "--figures", "all"], "nothing.npz"),
-    "policy for another plant": (["thin.npz", "--figures", "reward"], "another plant: arm is 0.1"),
-    "policy for another stand": (["wide.npz", "--figures", "stand"], "another plant: arm is 0.1"),
-    "nobody flies free": (["heave.npz", "--figures", "stand", "speeds"], "figure speeds needs a policy"),
-    "unsound curve": (["odd.npz", "--figures", "reward", "speeds"], "policy odd has an unsound training curve"),
-    "name of a baseline": (["copy.npz", "--figures", "reward"], "two followers are called 'copy'"),
+    "unknown figure": (["--only", "speed"], "invalid choice: 'speed'"),
+    "followers": (["--followers", "lqg"], "unrecognized arguments: --followers"),
+    "scenario": (["--omega", 1], "unrecognized arguments: --omega"),
+    "no such policy": (["nothing.npz"], "nothing.npz"),
+    "policy for another plant": (["thin.npz", "--only", "reward"], "another plant: arm is 0.1"),
+    "policy for another stand": (["wide.npz", "--only", "stand"], "another plant: arm is 0.1"),
+    "nobody flies free": (["heave.npz", "--only", "stand", "speeds"], "figure speeds needs a policy"),
+    "unsound curve": (["odd.npz", "--only", "reward", "speeds"], "policy odd has an unsound training curve"),
+    "name of a baseline": (["copy.npz", "--only", "reward"], "two followers are called 'copy'"),
 }
 
 
@@ -199,7 +191,7 @@ def test_figures_of_a_paper_are_pdf_of_a_columns_width(tmp_path: Path) -> None:
     arrays, card = load_arrays()
     write_arrays(tmp_path / "curved.npz", arrays, {**card, "curve": CURVE})
     out = tmp_path / "out"
-    assert call(main, [tmp_path / "curved.npz", "--figures", "reward", "--style", "paper", "--out", out]) == 0
+    assert call(main, ["figures", tmp_path / "curved.npz", "--only", "reward", "--style", "paper", "--out", out]) == 0
     assert {path.name for path in out.iterdir()} == {"figures.html", "figure-reward.pdf"}
     drawn = (out / "figure-reward.pdf").read_bytes()
     assert b"/FontFile2" in drawn
@@ -209,7 +201,7 @@ def test_figures_of_a_paper_are_pdf_of_a_columns_width(tmp_path: Path) -> None:
 
 def assert_refused(here: Path, arguments: list[Any], word: str, capsys: pytest.CaptureFixture[str]) -> None:
     before = listing(here)
-    code = call(main, [*FAST, *arguments])
+    code = call(main, ["figures", *FAST, *arguments])
     captured = capsys.readouterr()
     assert code == 2, captured
     assert_one_line(captured.err)
@@ -224,8 +216,8 @@ def test_bad_request_is_refused(here: Path, arguments: list[Any], word: str, cap
 
 @pytest.mark.parametrize(
     ("out", "word"),
-    [([], "--figures needs --out"), (["--out", "full"], "exists and is not empty")],
+    [([], "required: --out"), (["--out", "full"], "exists and is not empty")],
     ids=["none", "full"],
 )
 def test_figures_need_an_empty_place(here: Path, out: list[str], word: str, capsys: pytest.CaptureFixture) -> None:
-    assert_refused(here, [TRANSPORT, "--figures", "reward", *out], word, capsys)
+    assert_refused(here, [TRANSPORT, "--only", "reward", *out], word, capsys)

@@ -14,11 +14,11 @@ from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
 from mjxball.baselines import make_baseline
+from mjxball.bench import report as report_page
+from mjxball.bench import suites
+from mjxball.bench.report import write_report
+from mjxball.bench.scores import run_benchmark
 from mjxball.config import preset
-from mjxball.evaluate import report as report_page
-from mjxball.evaluate import suites
-from mjxball.evaluate.benchmark import run_benchmark
-from mjxball.evaluate.report import write_report
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.view.page import flight_page, page_contents
 from mjxfly.flight_log import Journal

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from mjxball.baselines import make_baseline
+from mjxball.bench import report
+from mjxball.bench.report import verdict, wins_by_suite
+from mjxball.bench.scores import Score, winners, wins
+from mjxball.bench.suites import Suite, Variant
 from mjxball.config import Plant, preset, with_plant
-from mjxball.evaluate import report
-from mjxball.evaluate.benchmark import Score, winners, wins
 from mjxball.evaluate.metrics import Metrics
-from mjxball.evaluate.report import verdict, wins_by_suite
 from mjxball.evaluate.results import Result, fly_scenarios
-from mjxball.evaluate.variants import Suite, Variant
 from mjxball.sim.scenario import Scenario
 
 GOOD = Metrics(

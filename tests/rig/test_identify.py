@@ -226,10 +226,6 @@ class TestPlantFile:
         assert setup.plant.rotor_lag == SOME.lag
         assert {scenario.mass for scenario in scenarios_of(options, setup)} == {PAIR.plant.object_mass}
 
-    def test_figures_do_not(self, tmp_path: Path, capsys) -> None:
-        assert evaluate.main(["--figures", "all", "--plant", str(self.write(tmp_path))]) == 2
-        assert "drop --plant" in capsys.readouterr().err
-
 
 class TestCommand:
     def test_from_log_to_plant_file(self, tmp_path: Path, monkeypatch, capsys, brief) -> None:

@@ -1,4 +1,4 @@
-"""Benchmark: every follower on every variant of the suites, over several seeds; scores, wins, and a text table."""
+"""Scores of followers on the variants of suites, over several seeds: medians, wins, and a text table."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball import terminal
+from mjxball.bench.suites import Suite, Variant
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.results import COLUMNS, MARK, Result, fly_scenarios, metric_text, scenario_title
-from mjxball.evaluate.variants import Suite, Variant
 
 # What the tables show and rank: less is better in each.
 RANKED = (
@@ -107,30 +107,17 @@ def run_benchmark(
     num_seeds: int,
     physics: str,
     progress: Callable[[str], None] = lambda text: None,
-    team_followers: Callable[[Config], Sequence[Follower]] = lambda config: [],
 ) -> list[Score]:
-    """Fly everything. The followers are designed for `base` and do not know what a variant changes.
-
-    `team_followers`: those that are designed for the configuration of a variant with a team of its own.
-    """
+    """Fly everything. The followers are designed for `base` and do not know what a variant changes."""
     scores: list[Score] = []
-    of_teams: dict[str, Sequence[Follower]] = {}
     for number, suite in enumerate(suites):
         progress(f"{number + 1}/{len(suites)} {suite.name}: {len(suite.variants)} variants x {num_seeds} seeds")
-        groups: dict[str, tuple[Config, list[Variant]]] = {}
+        flown = dict(_fly(base, followers, suite, num_seeds, physics))
         for variant in suite.variants:
-            nominal = variant.nominal(base)
-            groups.setdefault(configs.config_hash(nominal), (nominal, []))[1].append(variant)
-        for key, (nominal, variants) in groups.items():
-            own = followers
-            if variants[0].team:
-                of_teams[key] = own = of_teams.get(key) or team_followers(nominal)
-            flown = dict(_fly(nominal, own, replace(suite, variants=tuple(variants)), num_seeds, physics))
-            for variant in variants:
-                for index, follower in enumerate(own):
-                    results = [flown[variant.label, seed][index] for seed in range(num_seeds)]
-                    metrics = tuple(result.metrics for result in results)
-                    scores.append(Score(suite.name, variant.label, follower.name, metrics, results[0]))
+            for index, follower in enumerate(followers):
+                results = [flown[variant.label, seed][index] for seed in range(num_seeds)]
+                metrics = tuple(result.metrics for result in results)
+                scores.append(Score(suite.name, variant.label, follower.name, metrics, results[0]))
     return scores
 
 

@@ -1,4 +1,4 @@
-"""The benchmark's report: one HTML file that works offline, from Jinja2 templates."""
+"""The report of scores: one HTML file that works offline, from Jinja2 templates."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.baselines import LAWS
+from mjxball.bench.curves import flight_curves, heat_maps, variant_curves
+from mjxball.bench.scores import RANKED, Score, Summary, by_variant, winners, wins
+from mjxball.bench.suites import GRID, Suite
 from mjxball.config import Plant
-from mjxball.evaluate import plots
-from mjxball.evaluate.benchmark import RANKED, Score, Summary, by_variant, winners, wins
 from mjxball.evaluate.render import film
-from mjxball.evaluate.suites import GRID
-from mjxball.evaluate.variants import Suite
 from mjxball.files import write_whole
 from mjxball.policy import Policy
 
@@ -168,11 +167,11 @@ def _suite(suite: Suite, scores: Sequence[Score]) -> Row:
         "variants": [],
     }
     if grid:
-        return {**found, "figure": plots.heat_maps(scores)}
+        return {**found, "figure": heat_maps(scores)}
     if len(suite.variants) > 1:
-        found["figure"] = plots.variant_curves(scores, suite.axis)
+        found["figure"] = variant_curves(scores, suite.axis)
     for (_, label), group in by_variant(scores).items():
-        found["variants"].append({"label": label, "figure": plots.flight_curves(group), "rows": _rows(group)})
+        found["variants"].append({"label": label, "figure": flight_curves(group), "rows": _rows(group)})
     return found
 
 

@@ -1,16 +1,64 @@
-"""Suites of the benchmark: those of a pair, those of `team_suites`, and how they are found by name."""
+"""Suites: variants of the pair's reference flight along one axis of difficulty each, to see where a follower ends."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mjxball.errors import InputError
-from mjxball.evaluate.team_suites import TEAM_SUITES
-from mjxball.evaluate.variants import Suite, Variant
+from mjxball import config as configs
+from mjxball.config import Config
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One case of a suite: a scenario, and the settings that differ from the reference."""
+
+    label: str
+    scenario: Scenario
+    changes: Mapping[str, Any] = field(default_factory=dict)  # config path -> value
+    waveform: Callable[[int], tuple[tuple[float, ...], ...]] | None = None  # seed -> times, offsets
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether it is the reference scenario itself, which several suites have."""
+        s, changed = self.scenario, bool(self.changes or self.waveform)
+        return not changed and s.believed_mass in (None, s.mass) and s == Scenario(believed_mass=s.believed_mass)
+
+    def config(self, base: Config, seed: int) -> Config:
+        """The configuration of this variant for one seed; followers are made for `base`."""
+        for path, value in self.changes.items():
+            base = configs.replace(base, path, value)
+        if self.waveform:
+            base = dataclasses.replace(base, motion=configs.Motion("waveform", *self.waveform(seed)))
+        return configs.validate(base)
+
+    def seeded(self, seed: int) -> Scenario:
+        """The scenario of one seed. Seed 0 starts the CG at phase 0, the others at a place drawn from the seed."""
+        random = np.random.default_rng([seed, 7])
+        phase = 0.0 if seed == 0 else float(random.uniform(0, 2 * np.pi))
+        # A rolling ball has no phase: it starts on either side, up to 30 % nearer to O.
+        start = self.scenario.ball_start * (
+            1.0 if seed == 0 else float(random.choice([-1, 1]) * random.uniform(0.7, 1))
+        )
+        disturbance = dataclasses.replace(self.scenario.disturbance, seed=seed)
+        return dataclasses.replace(self.scenario, phase=phase, ball_start=start, disturbance=disturbance)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Variants along one axis of difficulty."""
+
+    name: str
+    about: str
+    axis: str  # what the variants' labels say
+    variants: tuple[Variant, ...]
+
 
 WALK_STEP, WALK_SIGMA = 0.5, 0.03  # time [s] between the samples of a random walk, deviation of one move [m]
 
@@ -52,7 +100,7 @@ def _with(**disturbance: Any) -> Scenario:
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 MASSES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 GRID = "speed-mass"  # drawn as heat maps
-PAIR_SUITES: tuple[Suite, ...] = (
+SUITES: tuple[Suite, ...] = (
     Suite("cg-speed", "the CG moves as a sine of 5 cm", "CG speed [rad/s]", _variants("omega", SPEEDS)),
     Suite(
         "cg-amplitude",
@@ -157,16 +205,7 @@ PAIR_SUITES: tuple[Suite, ...] = (
         ),
     ),
 )
-SUITES = (*PAIR_SUITES, *TEAM_SUITES)
 BY_NAME = {suite.name: suite for suite in SUITES}
-
-
-def find_suites(names: list[str]) -> list[Suite]:
-    """The suites called `names`, all of them for 'all'; InputError for an unknown one."""
-    unknown = [name for name in names if name not in BY_NAME and name != "all"]
-    if unknown:
-        raise InputError(f"unknown suite {unknown[0]!r}; there are all, {', '.join(BY_NAME)}")
-    return list(SUITES) if "all" in names else [BY_NAME[name] for name in dict.fromkeys(names)]
 
 
 def list_suites() -> str:

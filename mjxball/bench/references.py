@@ -1,0 +1,33 @@
+"""The best that classical followers which know the plant reach in the benchmark's flights."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from mjxball.baselines import make_baseline
+from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
+from mjxball.bench.success import bar, numbers
+from mjxball.bench.tracks import worlds_of
+from mjxball.config import Config
+from mjxball.control.followers import Baseline
+
+KNOWING_RIGS = {law.name: law for law in (KnownRigLqg, SlowKnownRigLqg)}
+
+
+@functools.cache
+def bars(track: str, draw: int, number: int) -> np.ndarray:
+    """(flights, 3): the `bar` of the flights of a track's world `number`, undisturbed and disturbed ones in turn.
+
+    The best of the references in each number apart, in the same flight; infinite where all of them failed.
+    """
+    world = worlds_of(track, draw)[number]
+    scenarios = world.reference_scenarios or tuple(one for pair in world.scenarios for one in pair)
+    found = world.fly([reference(name, world.config) for name in world.references], scenarios)
+    return bar(np.array([[numbers(one) for one in flights] for flights in found]).min(axis=0), world.length)
+
+
+def reference(name: str, config: Config) -> Baseline:
+    """The reference of that name, made for the plant of `config`."""
+    return Baseline(KNOWING_RIGS[name](config), config) if name in KNOWING_RIGS else make_baseline(name, config)

@@ -1,0 +1,38 @@
+"""fly mjxball-bench and write an entry of the leaderboard"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from mjxball import cli
+from mjxball.bench.tracks import TRACKS
+from mjxball.commands.followers import clock
+from mjxball.files import write_whole
+from mjxball.train.run_directory import commit, versions
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Of `eval.py bench`."""
+    parser.add_argument("follower", metavar="FOLLOWER", help="a policy, MODEL.onnx, module:Class, or a baseline's name")
+    about = f"tracks to fly: {', '.join(TRACKS)} (default all)"
+    parser.add_argument("--tracks", nargs="+", choices=TRACKS, default=list(TRACKS), metavar="NAME", help=about)
+    about = "other flights than the published ones (default 0)"
+    parser.add_argument("--draw", type=int, default=0, metavar="N", help=about)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json", help="where to write the entry")
+
+
+def run(options: argparse.Namespace, command: str) -> int:
+    """Fly and write; return the exit code."""
+    from mjxball.bench.entry import run as fly
+    from mjxball.bench.entry import table
+    from mjxball.bench.followers import entrant
+
+    cli.output_file(options.out, ".json")
+    name, make = entrant(options.follower)
+    found = fly(name, make, options.tracks, options.draw, clock())
+    known = {"command": command, "commit": commit(), "versions": versions()}
+    write_whole(options.out, json.dumps({**found, **known}, indent=1, allow_nan=False) + "\n")
+    print(f"{table(found)}\nthe entry is {options.out}")
+    return 0

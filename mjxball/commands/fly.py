@@ -1,0 +1,168 @@
+"""fly policies and baselines through scenarios and print their metrics"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mjxball import cli, config
+from mjxball.baselines import BASELINES
+from mjxball.bench.report import write_report
+from mjxball.bench.scores import scores_of
+from mjxball.commands.followers import Named, add_flight, add_followers, add_policies, load, named, refuse_same_names
+from mjxball.commands.scenarios import native_scenarios, scenarios_of, setup_of
+from mjxball.errors import InputError
+from mjxball.evaluate.plots import write_results
+from mjxball.evaluate.policies import check_bounds, group_by_plant
+from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
+from mjxball.evaluate.scenarios import rig_line, standard_scenarios
+from mjxball.files import write_whole
+from mjxball.plotting import STYLES
+from mjxball.policy import Policy
+from mjxball.sim.scenario import Scenario
+from mjxball.train.run_directory import versions
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Of `eval.py fly`."""
+    add_policies(parser)
+    add_flags(parser)
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Those of its arguments that `eval.py` takes without the word `fly` as well."""
+    add_followers(parser)
+    parser.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
+    parser.add_argument(
+        "--amplitude",
+        nargs="+",
+        type=float,
+        metavar="A",
+        help="CG amplitudes [m] (default 0.05, or what the plant allows)",
+    )
+    parser.add_argument(
+        "--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default the plant's, 0.2)"
+    )
+    parser.add_argument("--believed-mass", type=float, metavar="M", help="mass that hover thrust assumes (true mass)")
+    parser.add_argument("--wn-pitch", type=float, metavar="W", help="pitch natural frequency of both drones [rad/s]")
+    parser.add_argument(
+        "--goal",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="goal of O [m] (default 1 1 1, on a stand where it moves)",
+    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="length of each flight (default 45)")
+    parser.add_argument(
+        "--waveform", type=Path, metavar="FILE", help="CG offsets from a CSV file: time [s], offset [m] per line"
+    )
+    parser.add_argument("--rolling", type=float, metavar="X", help="a free ball that starts at X [m] from O")
+    parser.add_argument(
+        "--mass-change",
+        nargs="+",
+        metavar="T:DM",
+        help="DM [kg] added to, or if negative dropped from, the object at T [s]",
+    )
+    parser.add_argument(
+        "--plant", type=Path, metavar="NAME|FILE", help="shipped plant, file of a rig, or a model of a drone"
+    )
+    add_flight(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")
+    parser.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
+    about = "of the figures: screen (default), or paper: PDF of a column's width"
+    parser.add_argument("--style", choices=STYLES, default="screen", help=about)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Followers that fly the same plant."""
+
+    setup: config.Config
+    scenarios: Sequence[Scenario]
+    followers: Named
+
+    def policies(self, options: argparse.Namespace) -> list[Policy]:
+        """The policies, loaded to fit the plant; raise InputError for bounds that are wanted and missing."""
+        # A pitch frequency that was asked for is an experiment, not a mistake.
+        longest, laws = max(scenario.seconds for scenario in self.scenarios), options.wn_pitch is None
+        found = load(self.followers.paths, lambda path: self.setup, options.force, laws, longest)
+        unbounded = [policy.name for policy in found if options.check and not policy.card["bounds"]]
+        if unbounded:
+            raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
+        return found
+
+
+def run(options: argparse.Namespace, command: str) -> int:
+    """Fly every plant's scenarios; return the exit code.
+
+    The report of a plant other than the first one's has a directory of its own.
+    """
+    if options.style != "screen" and options.out is None:
+        raise InputError("--style belongs to figures, and needs --out DIR")
+    setup = setup_of(options)
+    scenarios = scenarios_of(options, setup)
+    if options.out:
+        cli.output_directory(options.out)
+    if options.json:
+        cli.output_file(options.json, ".json")
+    groups = _groups(options, setup, scenarios)
+    loaded = [(group, group.followers.made(group.setup, BASELINES), group.policies(options)) for group in groups]
+    for _, baselines, policies in loaded:
+        refuse_same_names([*(follower.name for follower in baselines), *(policy.name for policy in policies)])
+    every: list[Result] = []
+    code = 0
+    for number, (group, baselines, policies) in enumerate(loaded):
+        results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
+        if number:
+            print(f"\n{group.setup.preset}: its own plant and scenarios")
+        if options.plant or group.setup.plant != config.Plant():
+            print(rig_line(group.setup, max(scenario.mass for scenario in group.scenarios)))
+        print(table(results, standard_scenarios(group.setup)[0]))
+        if not number or groups[0].followers.asked:  # without arguments the JSON is about the paper's plant alone
+            every += results
+        if options.out:
+            place = options.out / group.setup.preset if number else options.out
+            write_results(results, place, options.style)
+            scores, suites = scores_of(results)
+            write_report(place, group.setup.plant, scores, suites, policies, command, versions())
+            print(f"report.html, figures and cells.json are in {place}")
+        if options.check:
+            code = max(code, _check(group.setup, policies, results, options.physics))
+    if options.json:
+        write_whole(options.json, to_json(every))
+    return code
+
+
+def _groups(options: argparse.Namespace, setup: config.Config, scenarios: Sequence[Scenario]) -> list[Group]:
+    who = named(options)
+    if options.check and not who.paths:
+        raise InputError("--check needs a policy")
+    here, others = (who.paths, []) if options.force or options.plant else group_by_plant(who.paths)
+    # Only policies for other plants: then the baselines beside them fly theirs, and nothing the paper's.
+    groups = [] if others and not here else [Group(setup, scenarios, Named(who.names, here, who.asked))]
+    for own, files in others:
+        groups.append(Group(own, native_scenarios(options, own), Named(who.names or ["copy"], files, True)))
+    return groups
+
+
+def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[Result], physics: str) -> int:
+    """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
+    own = setup.autopilot.kind != "ideal" or setup.plant != config.Plant()
+    plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
+    reference = standard_scenarios(plain)[0]
+    known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
+    missing = [policy for policy in policies if policy.name not in known]
+    if missing:
+        known |= {result.follower: result for result in fly_scenarios(plain, missing, [reference], physics)}
+    failed = False
+    for policy in policies:
+        misses = check_bounds(policy, known[policy.name].metrics)
+        failed = failed or bool(misses)
+        print(f"check {policy.name}: {'ok' if not misses else '; '.join(misses)}")
+    sys.stdout.flush()
+    return 1 if failed else 0
