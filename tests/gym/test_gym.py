@@ -60,10 +60,7 @@ def test_every_preset_of_a_pair_is_registered():
     "name",
     [
         "Transport",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in ("TransportLarge", "Paper", "Robust", "Stand", "Flight")
-        ),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("Paper", "Stand", "Flight")),
     ],
 )
 def test_gymnasiums_checker_finds_nothing(name: str):
