@@ -20,7 +20,7 @@ from mjxfly.limits import FlightSettings
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, State
 from mjxfly.telemetry import ObjectState, Rig
-from mjxfly.twin.conditions import FAULT_KINDS
+from mjxfly.twin.conditions import FAULT_KINDS, Surroundings
 from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
 
 FLIGHT = shipped_policy("flight")
@@ -113,6 +113,19 @@ def test_an_estimate_that_fails_later_still_leads_down() -> None:
         assert cut(track).position[2] - world.rest < 0.02, first
         stood = next(moment.time for moment in track if moment.position[2] - world.rest < 0.01)
         assert cut(track).time - stood < 1.7, first
+
+
+@pytest.mark.slow
+def test_a_hold_is_not_flown_by_what_was_measured_a_moment_ago() -> None:
+    """One estimate stands still, the other one's clock does: motors were cut 9 cm above the ground."""
+    pytest.importorskip("mujoco")
+    settings, around = FlightSettings(3.0, (0.0, 0.0, 0.15)), Surroundings(seed=884, delay=0.03)
+    world = VirtualTwin(Policy.load(FLIGHT), settings, surroundings=around, log=MemoryLog(False), settle=0.3)
+    world.fly_until(State.FLY)
+    world.fly_for(0.48)
+    world.drones[0].inject(FAULT_KINDS["frozen"].what)
+    world.fly_for(0.59)
+    assert cut(after(world, "clock", 1)).position[2] - world.rest < 0.02
 
 
 def test_a_descent_has_the_time_that_its_height_asks() -> None:
