@@ -24,7 +24,7 @@
 #define REST 150u             /* [ms] in which what stands does not sink by more than RESTING */
 #define RESTING 0.005f        /* [m] */
 #define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
-/* The take-off, as in fly/takeoff.py. */
+/* The take-off, as in takeoff.py of mjxfly. */
 #define BEGIN 0.85f           /* of the ramp, from which on thrust follows the climb */
 #define LIFT_TIME 4000u       /* [ms] beyond the ramp */
 #define LIFTED 0.05f          /* [m] */
