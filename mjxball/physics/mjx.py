@@ -189,6 +189,6 @@ def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Flo
     rows = [coupling[i] for i in range(3)]
     squares = jnp.stack([jnp.stack([rotations.dot(a, b) for b in rows]) for a in rows])
     push = jnp.stack([rotations.dot(row, force[:3]) for row in rows])
-    angular = rotations.solve(mass[3:, 3:] - squares / total, force[3:] - push / total)
+    angular = rotations.solve_symmetric(mass[3:, 3:] - squares / total, force[3:] - push / total)
     back = rotations.rotate_back(coupling, angular)
     return jnp.concatenate([(force[:3] - back) / total, angular])

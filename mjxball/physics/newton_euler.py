@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from mjxball import arrays
 from mjxball.arrays import Array
 from mjxball.config import Attitude, Plant
-from mjxball.control.rotations import cross, dot, matrix_from_quaternion, rotate, solve
+from mjxball.control.rotations import cross, dot, matrix_from_quaternion, rotate, solve_symmetric
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, coordinates, joined, solve_small
 from mjxball.plant import ROLLING_INERTIA, PlantParameters, plant_parameters
 from mjxball.plant.parameters import diagonal, point_inertia, rigid_inertia, rigid_mass, rigid_moment
@@ -113,7 +113,7 @@ def _free(balance: Balance) -> tuple[Vector, Vector]:
     """Eliminate a_b: (J_O - (|S|^2 1 - S S^T) / M) w' = n - S x f / M."""
     mass, moment, inertia, _, force, torque = balance
     arm = moment / mass
-    angular = solve(inertia - mass[..., None] * point_inertia(arm), torque - cross(arm, force))
+    angular = solve_symmetric(inertia - mass[..., None] * point_inertia(arm), torque - cross(arm, force))
     return force / mass - cross(angular, arm), angular
 
 

@@ -120,7 +120,7 @@ def test_solve_solves(half, vector):
     matrix = half @ half.T + np.eye(3)  # symmetric, condition number at most 1 + 9
     expected = np.linalg.solve(matrix, vector)
     # The adjugate loses about the square of the condition number: 100 ulp of a solution up to 17.
-    np.testing.assert_allclose(rotations.solve(matrix, vector), expected, rtol=0, atol=4e-13)
+    np.testing.assert_allclose(rotations.solve_symmetric(matrix, vector), expected, rtol=0, atol=4e-13)
 
 
 @given(st.floats(-3, 3))
@@ -145,6 +145,6 @@ def test_every_rotation_takes_batches():
     assert matrices.shape == (4, 5, 3, 3)
     np.testing.assert_array_equal(matrices[2, 3], matrix_from_euler(euler[2, 3]))
     np.testing.assert_array_equal(
-        rotations.solve(matrices + np.swapaxes(matrices, -1, -2), euler)[2, 3],
-        rotations.solve(matrices[2, 3] + matrices[2, 3].T, euler[2, 3]),
+        rotations.solve_symmetric(matrices + np.swapaxes(matrices, -1, -2), euler)[2, 3],
+        rotations.solve_symmetric(matrices[2, 3] + matrices[2, 3].T, euler[2, 3]),
     )

@@ -84,7 +84,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.multiply_quaternions": (rotations.multiply_quaternions, (QUATERNION, QUATERNION[::-1])),
     "rotations.quaternion_from_euler": (rotations.quaternion_from_euler, (EULER,)),
     "rotations.integrate_quaternion": (rotations.integrate_quaternion, (QUATERNION, 0.2 * EULER)),
-    "rotations.solve": (rotations.solve, (SYMMETRIC, normal(3))),
+    "rotations.solve_symmetric": (rotations.solve_symmetric, (SYMMETRIC, normal(3))),
     "rotations.dot": (rotations.dot, (normal(3), normal(3))),
     "rotations.roll_of_quaternion": (rotations.roll_of_quaternion, (QUATERNION,)),
     "leader.desired_acceleration": (
