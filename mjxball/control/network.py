@@ -1,6 +1,6 @@
-"""A follower's network: inputs normalised, ReLU layers, and perhaps a gated recurrent unit below them.
+"""A follower's network: normalised inputs, ReLU layers, and optionally a gated recurrent unit (GRU) below them.
 
-Written once, for training and for flight; runs on NumPy and on JAX arrays.
+The same code serves training and flight, on NumPy and JAX arrays.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ from mjxball.arrays import Array, matmul
 def gru_cell(hidden: Array, seen: Array, kernel: Array, recurrent: Array, bias: Array) -> Array:
     """The next state (..., H) of a GRU in state `hidden` (..., H) at the input `seen` (..., n).
 
-    `kernel` (n, 3 H), `recurrent` (H, 3 H) and `bias` (3 H,) hold, side by side, the reset gate, the update gate and
-    the candidate. After Cho et al. 2014, the reset gate applied behind the product, as cuDNN and Flax do; an update
+    `kernel` (n, 3 H), `recurrent` (H, 3 H) and `bias` (3 H,) hold the reset gate, the update gate and the candidate
+    side by side. After Cho et al. 2014, with the reset gate applied after the product, as cuDNN and Flax do; an update
     gate of 1 keeps the state.
     """
     xp, size = hidden.__array_namespace__(), hidden.shape[-1]
-    given, kept = matmul(seen, kernel) + bias, matmul(hidden, recurrent)
+    from_input, from_state = matmul(seen, kernel) + bias, matmul(hidden, recurrent)
     # The logistic function as a hyperbolic tangent, which does not overflow.
-    gates = 0.5 + 0.5 * xp.tanh(0.5 * (given[..., : 2 * size] + kept[..., : 2 * size]))
+    gates = 0.5 + 0.5 * xp.tanh(0.5 * (from_input[..., : 2 * size] + from_state[..., : 2 * size]))
     reset, update = gates[..., :size], gates[..., size:]
-    candidate = xp.tanh(given[..., 2 * size :] + reset * kept[..., 2 * size :])
+    candidate = xp.tanh(from_input[..., 2 * size :] + reset * from_state[..., 2 * size :])
     return candidate + update * (hidden - candidate)
 
 
 class Network(NamedTuple):
-    """What a policy file has learned, for inputs of any batch shape and array namespace.
+    """The network of a policy file, for inputs of any batch shape and array namespace.
 
-    Without `gru` an input (..., n) goes through ReLU layers. With it the last H numbers of the input are the GRU's
-    state: the first layer sees the next state and the normalised input, the last layer the layer below and that state.
+    Without `gru` an input (..., n) goes through ReLU layers. With it the last H values of the input are the GRU's
+    state: the first layer gets the next state and the normalised input, the last layer gets the layer below and that
+    state.
     """
 
     weights: Sequence[Array]
@@ -43,13 +44,13 @@ class Network(NamedTuple):
     gru: tuple[Array, Array, Array] | None = None  # `gru_cell`'s kernel, recurrent, bias
 
     def __call__(self, seen: Array) -> Array:
-        """Action in [-1, 1] (..., 3) for the input `seen` (..., n), and behind it the next state (..., H) of a GRU."""
+        """Action in [-1, 1] (..., 3) for the input `seen` (..., n), followed by the next state (..., H) of a GRU."""
         xp = seen.__array_namespace__()
         value, hidden = self.outputs(seen)
         return xp.tanh(value) if hidden is None else xp.concat([xp.tanh(value), hidden], axis=-1)
 
     def outputs(self, seen: Array) -> tuple[Array, Array | None]:
-        """(the last layer before its tanh, the next state of a GRU or None)."""
+        """Output of the last layer before its tanh (..., 3), and the next state of a GRU (..., H) or None."""
         xp, width = seen.__array_namespace__(), self.mean.shape[-1]
         below = (seen[..., :width] - self.mean) * self.scale
         if self.gru is None:
@@ -66,7 +67,7 @@ class Network(NamedTuple):
         return matmul(below, self.weights[-1]) + self.biases[-1]
 
     def like(self, seen: Array) -> Network:
-        """The same with arrays of the namespace and dtype of `seen`."""
+        """The same network with arrays of the namespace and dtype of `seen`."""
         if isinstance(seen, np.ndarray) and seen.dtype == self.mean.dtype:
             return self
         xp = seen.__array_namespace__()

@@ -8,7 +8,7 @@ from mjxball.arrays import Array, clipped, joined
 def rotate(matrix: Array, vector: Array) -> Array:
     """R v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3).
 
-    A sum of products: of one small matrix product a world XLA makes a call each, in TF32 on a GPU.
+    Written as a sum of products: XLA makes each small matrix product a separate call, in TF32 on a GPU.
     """
     return (matrix * vector[..., None, :]).sum(axis=-1)
 
@@ -19,7 +19,7 @@ def rotate_back(matrix: Array, vector: Array) -> Array:
 
 
 def turned_about_z(vectors: Array, angle: Array) -> Array:
-    """Every three numbers of `vectors` (..., 3 k) as a vector, turned by `angle` (...) about z [rad]."""
+    """`vectors` (..., 3 k), k vectors side by side, each turned by `angle` (...) about z [rad]."""
     xp = vectors.__array_namespace__()
     angle = xp.asarray(angle, dtype=vectors.dtype)[..., None]
     c, s = xp.cos(angle), xp.sin(angle)
@@ -106,7 +106,7 @@ def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
 
 
 def solve(matrix: Array, vector: Array) -> Array:
-    """Solve 3 x 3 systems `matrix` (..., 3, 3) by their adjugates, of cross products; `vector` (..., 3) -> (..., 3)."""
+    """Solve 3 x 3 systems `matrix` (..., 3, 3) by adjugates from cross products; `vector` (..., 3) -> (..., 3)."""
     a, b, c = (matrix[..., i, :] for i in range(3))
     adjugate = joined([cross(b, c), cross(c, a), cross(a, b)])
     return rotate(adjugate, vector) / dot(a, adjugate[..., 0])[..., None]
