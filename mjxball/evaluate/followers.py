@@ -1,4 +1,4 @@
-"""Followers of the user's own, `module:Class`, beside the classical ones: found by name, every answer checked."""
+"""Followers by name: classical ones, and a user's `module:Class`, whose answers are checked."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower, checked_command
 from mjxball.errors import FOREIGN, InputError, said
 
-LARGEST = 1e9  # of a command, in rad and m/s^2; the square of what is larger is soon no number
+LARGEST = 1e9  # of a command, in rad and m/s2; larger values soon overflow when squared
 PACKAGE = Path(__file__).parents[1]
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
 
 def find_follower(text: str, flag: str) -> tuple[str, Make]:
-    """(name, what makes it for a plant) of a classical follower, or of the class that `text` = module:Class names.
+    """(name, function that makes it for a plant) of a classical follower or of the class `text` = module:Class.
 
-    Such a class is called with the `Config` and is a law (`mjxball.control.followers.Law`) or a follower
-    (`Follower`). Raises InputError, which says `flag`, if there is none of that name.
+    The class is called with the `Config` and is a `mjxball.control.followers.Law` or a `Follower`. Raises InputError,
+    which names the flag `flag`, if there is none of that name.
     """
     if text in LAWS or ":" not in text:
         return text, lambda config: make_baseline(text, config)
@@ -34,7 +34,7 @@ def find_follower(text: str, flag: str) -> tuple[str, Make]:
 
 
 class Outside:
-    """A follower from outside, whose every answer is checked."""
+    """A user's `Follower` whose answers are checked."""
 
     def __init__(self, name: str, answer: Any):
         self.name, self._answer = name, answer
@@ -44,13 +44,13 @@ class Outside:
         _guarded(self.name, self._answer.reset)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """See `Follower.__call__`; InputError if it raises, or answers what is no command."""
-        own = np.array(observation)  # which it may write to
-        return answered(self.name, _guarded(self.name, self._answer, own, given=observation), observation)
+        """See `Follower.__call__`; InputError if it raises or returns no command."""
+        copied = np.array(observation)  # the user's code may write to it
+        return answered(self.name, _guarded(self.name, self._answer, copied, given=observation), observation)
 
 
 class OutsideLaw:
-    """A law from outside, likewise."""
+    """A user's `Law` whose answers are checked."""
 
     def __init__(self, name: str, law: Any):
         self.name, self._law = name, law
@@ -65,7 +65,7 @@ class OutsideLaw:
         answer = _guarded(self.name, self._law.step, state, observation, privileged, given=observation)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise InputError(
-                f"follower {self.name} answered {type(answer).__name__}; a law's step gives (state, command)"
+                f"follower {self.name} answered {type(answer).__name__}; step must return (state, command)"
             )
         return answer[0], answered(self.name, answer[1], observation)
 
@@ -95,12 +95,12 @@ def _guarded(name: str, function: Any, *arguments: Any, given: Any = None) -> An
 
 
 def _is_ours(file: str) -> bool:
-    """Whether a source file is mjxball's or an installed library's, not the user's."""
+    """Whether a source file belongs to mjxball or an installed library, not to the user."""
     return Path(file).is_relative_to(PACKAGE) or "site-packages" in file
 
 
 def answered(name: str, command: Any, observation: np.ndarray) -> np.ndarray:
-    """`checked_command` of follower `name`; InputError also if it is not finite, or beyond `LARGEST`."""
+    """`checked_command` of follower `name`; InputError also if it is not finite or exceeds `LARGEST`."""
     found = checked_command(name, command, observation)
     if not (np.abs(found) <= LARGEST).all():
         raise InputError(f"follower {name} answered a number that is not finite, or larger than {LARGEST:g}")
