@@ -81,9 +81,9 @@ class Takeover:
         base = xp.concat([rest, vertical[..., None]], axis=-1)[..., None, :]
         base = xp.broadcast_to(base, (*base.shape[:-2], model.followers, 3))
         turns = self._lever_torque(led, base, lifting, level)[..., model.turned] + torque
-        wanted = kp * (count * (desired[..., :2] - rest) - leader_factor * (led[..., :2] - rest))
-        wanted = wanted - xp.clip(model.on_axes(turns), -torque_limits, torque_limits)
-        wrench = xp.concat([0.0 * wanted[..., :1], wanted], axis=-1)
+        torque_left = kp * (count * (desired[..., :2] - rest) - leader_factor * (led[..., :2] - rest))
+        torque_left = torque_left - xp.clip(model.on_axes(turns), -torque_limits, torque_limits)
+        wrench = xp.concat([0.0 * torque_left[..., :1], torque_left], axis=-1)
         followed = self._limited(base, base + model.corrections(wrench, carried, thrust), carried, limits)
 
         angles = leader_factor * led[..., :2] + (model.of_followers(factor)[..., None] * followed[..., :2]).sum(axis=-2)

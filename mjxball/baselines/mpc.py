@@ -238,16 +238,16 @@ class Mpc:
     def _command(self, own: Design, x: Array, hover: Array, kind: Array) -> Array:
         """Command (..., 3) at state `x` (..., n). The vertical part is clipped first, because it uses rotor force."""
         xp, (tilt_limit, vertical_limit) = x.__array_namespace__(), self._leader[-2:]
-        wanted, far = times(own.feedback, x), times(own.far, x)
+        desired, far = times(own.feedback, x), times(own.far, x)
         correction, known = self._corrections(x, hover, kind)
         limited = clipped(far, -own.far_limit, own.far_limit) - far
-        wanted = wanted + times(own.correction, xp.where(known[..., None], correction, limited))
-        vertical = clipped(wanted[..., 2], -vertical_limit, vertical_limit)
+        desired = desired + times(own.correction, xp.where(known[..., None], correction, limited))
+        vertical = clipped(desired[..., 2], -vertical_limit, vertical_limit)
         room, parts = self._room(vertical, hover), []
         for axis, angle, rate in AXES:
             kp, kd = float(self._limits.kp[axis]), float(self._limits.kd[axis])
             rest = x[..., angle] + kd / kp * x[..., rate]
-            parts.append(clipped(wanted[..., axis], rest - room / kp, rest + room / kp))
+            parts.append(clipped(desired[..., axis], rest - room / kp, rest + room / kp))
         return clip_command(joined([*parts, vertical]), tilt_limit, vertical_limit)
 
     def _corrections(self, x: Array, hover: Array, kind: Array) -> tuple[Array, Array]:

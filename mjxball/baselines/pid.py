@@ -82,9 +82,9 @@ class Pid:
         short, slow = leaning - observation[..., 4], rising + velocity[..., 2]
         held = state.pitch + gains.pitch * short - gains.rate * observation[..., 10]
         lift = state.vertical + 2.0 * (speeding + gains.climb * slow)
-        wanted = joined([-2.0 * aside, 2.0 * ahead + held, lift]) - led
-        command = leader.clip_command(wanted, *limits)
-        beyond = wanted - command
+        desired = joined([-2.0 * aside, 2.0 * ahead + held, lift]) - led
+        command = leader.clip_command(desired, *limits)
+        beyond = desired - command
         pitch = gains.pitch_integral * clipped(short, -gains.pitch_band, gains.pitch_band)
         vertical = gains.climb_integral * clipped(slow, -gains.climb_band, gains.climb_band)
         return PidState(

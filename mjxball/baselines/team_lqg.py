@@ -107,9 +107,9 @@ class TeamOffsetFree:
         rise = xp.clip(far[..., 2], -TUNING.lift_limit, TUNING.lift_limit)
         vertical = xp.clip(ratio * (rise - lift) - (ratio - 1.0) * led[..., 2], -limit, limit)
         held = load / self.stiffness + lever * (vertical - led[..., 2])[..., None]
-        wanted = _within(far[..., :2], TUNING.tilt_limit) + back[..., :2] - _within(held, CORRECTION_LIMIT)
+        desired = _within(far[..., :2], TUNING.tilt_limit) + back[..., :2] - _within(held, CORRECTION_LIMIT)
         rest = observation[..., 3:5] + self._damping * observation[..., 9:11]
-        tilts = ratio * wanted - (ratio - 1.0) * led[..., :2]
+        tilts = ratio * desired - (ratio - 1.0) * led[..., :2]
         tilts = rest + room * _within((tilts - rest) / room, 1.0)
         return xp.concat([tilts, vertical[..., None]], axis=-1)
 

@@ -27,7 +27,7 @@ KINDS = {
 }
 LARGEST = 1e9  # bound on any value
 SHARES = ("met", "low", "high", "failed")  # required values of one condition
-NUMBERS = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
+VALUES = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
 
 
 def run(
@@ -117,9 +117,9 @@ def _check_kinds(path: Path, entry: dict[str, Any]) -> None:
 
 def _measured(values: Any) -> bool:
     """Whether `values` are one condition's results, as `success.summary` returns them."""
-    if not isinstance(values, dict) or set(values) != NUMBERS or type(values["flights"]) is not int:
+    if not isinstance(values, dict) or set(values) != VALUES or type(values["flights"]) is not int:
         return False
-    if not all(values[name] is None or type(values[name]) in (int, float) for name in NUMBERS):
+    if not all(values[name] is None or type(values[name]) in (int, float) for name in VALUES):
         return False
     if any(values[name] is None for name in SHARES):
         return False
@@ -130,7 +130,7 @@ def _measured(values: Any) -> bool:
         and failed >= 0
         and met + failed <= 1 + 1e-9
         and 0 <= limit <= 1
-        and all(0 <= (values[name] or 0) < LARGEST for name in NUMBERS)
+        and all(0 <= (values[name] or 0) < LARGEST for name in VALUES)
     )
 
 

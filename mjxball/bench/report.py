@@ -83,7 +83,7 @@ def write_page(
     made = {
         "command": command,
         "versions": json.dumps(dict(versions), indent=1),
-        "cards": {name: json.dumps(one, indent=1, default=str) for name, one in metadata.items()},
+        "metadata": {name: json.dumps(one, indent=1, default=str) for name, one in metadata.items()},
     }
     write_whole(path, environment.get_template(template).render(**context, **made))
 

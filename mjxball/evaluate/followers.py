@@ -52,17 +52,17 @@ class Outside:
 class OutsideLaw:
     """A user's `Law` whose answers are checked."""
 
-    def __init__(self, name: str, law: Any):
-        self.name, self._law = name, law
-        self.needs_privileged = bool(_guarded(name, getattr, law, "needs_privileged", False))
+    def __init__(self, name: str, controller: Any):
+        self.name, self._controller = name, controller
+        self.needs_privileged = bool(_guarded(name, getattr, controller, "needs_privileged", False))
 
     def start(self, observation: Any) -> Any:
         """See `Law.start`."""
-        return _guarded(self.name, self._law.start, observation, given=observation)
+        return _guarded(self.name, self._controller.start, observation, given=observation)
 
     def step(self, state: Any, observation: Any, privileged: Any) -> Any:
         """See `Law.step`."""
-        answer = _guarded(self.name, self._law.step, state, observation, privileged, given=observation)
+        answer = _guarded(self.name, self._controller.step, state, observation, privileged, given=observation)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise InputError(
                 f"follower {self.name} answered {type(answer).__name__}; step must return (state, command)"

@@ -34,7 +34,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
     keeps float32 as accurate as possible.
     """
     stages = _Stages(plant, plant_parameters(plant, attitude), parameters)
-    share = stages.numbers.moving_fraction
+    share = stages.parameters.moving_fraction
 
     def prescribed(
         state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
@@ -70,7 +70,7 @@ class _Stages:
 
     def __init__(self, plant: Plant, nominal: PlantParameters, parameters: PlantParameters | None):
         self._mjx = import_mjx()
-        self.numbers = nominal if parameters is None else parameters
+        self.parameters = nominal if parameters is None else parameters
         # Merging the welded bodies is exact and faster. A shell of varying mass must stay a separate body, and so must
         # drones whose parameters differ from the model's.
         self._fused = plant.moving_fraction == 1 and parameters is None
@@ -121,7 +121,7 @@ class _Stages:
         return mass.at[axes, axes].add(jnp.diag(inertia)), bias.at[axes].add(gyration)
 
     def _loaded(self, object_mass: Scalar, dtype: Any) -> Any:
-        m, own = self._model, self.numbers
+        m, own = self._model, self.parameters
         mass, inertia, armature = (a.astype(dtype) for a in (m.body_mass, m.body_inertia, m.dof_armature))
         share = own.moving_fraction
         moving = object_mass * share

@@ -83,14 +83,14 @@ class MujocoWorld:
     def __init__(self, plant: Plant, attitude: Attitude):
         self.model = build_model(plant)
         self.data = mujoco.MjData(self.model)
-        self._plant, self._numbers = plant, plant_parameters(plant, attitude)
+        self._plant, self._parameters = plant, plant_parameters(plant, attitude)
         self._shell, self._ball = self.model.body(ASSEMBLY).id, self.model.body(BALL).id
         self._drones = [self.model.body(name).id for name in drone_names(plant)]
         self._slides = slice(self.model.nv - len(plant.directions), self.model.nv)
 
     def place(self, state: PlantState, object_mass: float, offset: Array, rate: Array) -> None:
         """Set mass, positions and velocities, and compute what depends on them; all applied forces are 0 afterwards."""
-        model, data, share, own = self.model, self.data, self._plant.moving_fraction, self._numbers
+        model, data, share, own = self.model, self.data, self._plant.moving_fraction, self._parameters
         model.body_mass[self._shell] = object_mass * (1 - share) + own.carrier_mass
         model.body_mass[self._ball] = object_mass * share
         model.body_inertia[self._shell] = object_mass * own.shell_inertia_per_mass + own.carrier_inertia
@@ -138,7 +138,7 @@ class MujocoWorld:
     def load_drones(self, state: PlantState, rotor_force: Float[Array, "drones 4"]) -> None:
         """Apply each drone's rotor wrench to the drone's body, so that the welds carry it to the object."""
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        wrenches = rotor_wrenches(self._plant, self._numbers, rotor_force)
+        wrenches = rotor_wrenches(self._plant, self._parameters, rotor_force)
         for body, wrench in zip(self._drones, wrenches, strict=True):
             self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
             self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]

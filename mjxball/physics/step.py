@@ -250,5 +250,5 @@ def on_the_host() -> AbstractContextManager[Any]:
 
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:  # JAX was told to leave the CPU alone
+    except RuntimeError:  # the CPU backend is disabled
         return contextlib.nullcontext()

@@ -105,9 +105,9 @@ def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
 
 def training_rigs(config: Config) -> RigTable:
     """`rigs.number` rigs of each of `scenario.team_sizes`, (sizes, number, ...), in float32."""
-    drawn = [draw_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
-    table = joined(drawn)
-    shape = (len(drawn), config.rigs.number)
+    sampled = [draw_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
+    table = joined(sampled)
+    shape = (len(sampled), config.rigs.number)
 
     def folded(part: Array) -> Array:
         return np.asarray(part, np.float32).reshape(*shape, *part.shape[1:])
