@@ -103,7 +103,7 @@ class Requirements:
 
     delay: float = 0.01  # nominal delay: filters, estimator, sampling, motor drivers [s]
     phase: float = 50.0  # at nominal lag, inertia and delay [deg]
-    gain: float = 3.0  # either way, likewise
+    gain: float = 3.0  # up and down, likewise
     worst_phase: float = 15.0  # [deg]
     worst_gain: float = 2.0
     worst_delay: float = 0.02  # [s]

@@ -81,8 +81,8 @@ class ClosedLoop(Laws):
 
         `follower` is the followers' answer to `observation`, in their mount frames. `goals` are those of O at the
         beginning and the end of the period [m]. `load` includes the external force during the period; `sample` disturbs
-        the measurement at its end. `on_pid` (...) is 1 for a network whose output is added to the PID controller's
-        command, 0 for one whose output is the whole command. `physics` replaces the loop's physics.
+        the measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
+        (`follower.residual_on_pid`), 0 for a follower whose command is complete. `physics` replaces the loop's physics.
         """
         measured = self._leader_measurement(state, observation, goals[0])
         commands = self._commands(measured, state.integral, follower, goals[0], on_pid)
