@@ -23,7 +23,7 @@ MASS_SLOPE, MASS_LIMIT = 0.35, 0.5  # [1/s], per follower [kg]
 CORRECTION_LIMIT = 0.5  # [rad] of roll and pitch, with mass adaptation
 
 
-class State(NamedTuple):
+class AdaptiveState(NamedTuple):
     """State of the adaptive follower, in body axes; A is the number of axes about which the load acts."""
 
     integral: Any  # (..., 3) see `CopiedPid`
@@ -70,15 +70,15 @@ class Adaptive:
         self._mass_gain = (MASS_GAIN if followers == 1 else TEAM_MASS_GAIN) / model.gravity
         self._mass_limit = followers * MASS_LIMIT
 
-    def start(self, observation: Array) -> State:
+    def start(self, observation: Array) -> AdaptiveState:
         """See `Law.start`."""
         xp, observation = observation.__array_namespace__(), self._model.seen(observation)
         zero = xp.zeros_like(observation[..., 0])
         zeros = xp.zeros_like(observation[..., : len(self._model.axes)])
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
-        return State(self._pid.start(observation), zeros, zeros, zeros, zero, error, error_rate, zero)
+        return AdaptiveState(self._pid.start(observation), zeros, zeros, zeros, zero, error, error_rate, zero)
 
-    def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
+    def step(self, state: AdaptiveState, observation: Array, privileged: PrivilegedInfo) -> tuple[AdaptiveState, Array]:
         """See `Law.step`."""
         xp, model, axes = observation.__array_namespace__(), self._model, self._model.turned
         slope, first, second = (xp.asarray(gain, dtype=observation.dtype) for gain in self._gains)
@@ -108,7 +108,7 @@ class Adaptive:
         command = xp.concat([copied[..., None, :2] + tilt, lift[..., None]], axis=-1)
         return after, model.sent(clip_command(command, *self._limits))
 
-    def _mass(self, state: State, observation: Array, carried: Array) -> State:
+    def _mass(self, state: AdaptiveState, observation: Array, carried: Array) -> AdaptiveState:
         """`state` with the extra mass that explains the height; `carried` (..., N) are the drones' assumed masses."""
         xp, period = observation.__array_namespace__(), self._model.period
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]

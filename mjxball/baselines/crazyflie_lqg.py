@@ -120,7 +120,7 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     return LinearModel(a[np.ix_(indices, indices)], b[indices], tuple(names), loop.integral_limit, limit)
 
 
-class State(NamedTuple):
+class LqgState(NamedTuple):
     """State of the controller between control steps."""
 
     expected: Array  # (..., n) states of the model, see `Filter`
@@ -148,12 +148,12 @@ class CrazyflieLqg:
         self._state_bounds = self._bounds(("rate_integral", "load"), limits)
         self._error_bounds = self._bounds(("y", "height"), ERROR_LIMIT)
 
-    def start(self, observation: Array) -> State:
+    def start(self, observation: Array) -> LqgState:
         """See `Law.start`."""
         zero = observation.__array_namespace__().zeros_like(observation[..., :2])
-        return State(self._filter.start(times(self._measurement, observation)), zero, self._pid.start(observation))
+        return LqgState(self._filter.start(times(self._measurement, observation)), zero, self._pid.start(observation))
 
-    def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
+    def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
         """See `Law.step`."""
         xp = observation.__array_namespace__()
         estimate = self._filter.corrected(state.expected, times(self._measurement, observation))
@@ -165,7 +165,7 @@ class CrazyflieLqg:
         vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
         vertical = _clip(vertical, self._limits[1])
         sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
-        return State(self._filter.moved(estimate, command), command, integral), sent
+        return LqgState(self._filter.moved(estimate, command), command, integral), sent
 
     def _bounds(self, names: tuple[str, ...], limits: Any) -> np.ndarray:
         """Bounds (n,): `limits` for the states `names` that the model has, infinity for the others."""

@@ -28,7 +28,7 @@ SLOW = Tuning(position=0.15, velocity=0.6, height=0.15, climb=0.6, torque_walk=0
 OFFSET_FREE = Tuning(position=0.2, velocity=0.6, height=0.2, climb=0.6, torque_walk=0.003, lift_walk=0.01)
 
 
-class Takeover:
+class LqrFollower:
     """Base of `lqg` and `memoryless`, which differ in how they estimate the load's torque d."""
 
     needs_privileged = False
@@ -123,7 +123,7 @@ class Takeover:
         return model.lever_torque(lifting * asked / level[..., None] - own)
 
 
-class Memoryless(Takeover):
+class Memoryless(LqrFollower):
     """d from the torque balance at standstill: N Kp (theta - theta*) + N Kd q."""
 
     name = "memoryless"
@@ -144,7 +144,7 @@ class Memoryless(Takeover):
         return state, model.sent(followed)
 
 
-class Lqg(Takeover):
+class Lqg(LqrFollower):
     """d from a steady-state Kalman filter on angle, rate, d, d' and the rotors' torque about each of the load's axes.
 
     With a `lift_walk` the filter also estimates an uncommanded vertical acceleration, as from an error of the mass. The

@@ -25,7 +25,7 @@ KINDS = {
     **{"draw": int, "follower": str, "date": str, "command": str, "commit": str},
     **{"versions": dict, "tracks": dict, "not_flown": dict},
 }
-LARGEST = 1e9  # bound on any value
+MAX_VALUE = 1e9  # bound on any value
 SHARES = ("met", "low", "high", "failed")  # required values of one condition
 VALUES = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
 
@@ -130,7 +130,7 @@ def _measured(values: Any) -> bool:
         and failed >= 0
         and met + failed <= 1 + 1e-9
         and 0 <= limit <= 1
-        and all(0 <= (values[name] or 0) < LARGEST for name in VALUES)
+        and all(0 <= (values[name] or 0) < MAX_VALUE for name in VALUES)
     )
 
 

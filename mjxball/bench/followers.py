@@ -20,7 +20,7 @@ from mjxball.policy import Policy, policy_path, shipped_policies
 
 __all__ = ["Make", "checked", "entrant"]
 
-SLOWEST = 0.020  # largest median time of CALLS consecutive calls for one flight [s]
+MAX_CALL_TIME = 0.020  # largest median time of CALLS consecutive calls for one flight [s]
 CALLS = 20
 TYPES = {"observation": "tensor(float)", "memory": "tensor(float)", "start": "tensor(bool)"}  # of inputs
 UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # with privileged information, or no controllers
@@ -129,10 +129,10 @@ def checked(make: Make, config: Config, calls: int = CALLS) -> Follower:
         begun = time.perf_counter()
         answered(follower.name, follower(observation), observation)
         taken.append(time.perf_counter() - begun)
-        slow = [one for one in taken if one > SLOWEST]
+        slow = [one for one in taken if one > MAX_CALL_TIME]
         if len(slow) > CALLS // 2:
             raise InputError(
-                f"follower {follower.name} takes {1e3 * min(slow):.0f} ms a call; at most {1e3 * SLOWEST:.0f} ms"
+                f"follower {follower.name} takes {1e3 * min(slow):.0f} ms a call; at most {1e3 * MAX_CALL_TIME:.0f} ms"
             )
     follower.reset()
     return follower

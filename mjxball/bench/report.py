@@ -24,7 +24,7 @@ UNITS = {"rmse": "m", "settling_time": "s", "x_peak": "m", "peak": "m", "max_til
 UNITS |= {"smoothness": "rad", "command_spread": "rad"}
 COUNTED = {"peak": "steady-state peak", "rmse": "RMSE", "settling_time": "settling time", "overshoot": "overshoot"}
 RIVALS = ("adaptive", "lqg", "lqg-slow")  # followers that others are compared with one by one
-CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
+HIDDEN_METADATA = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
 LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 3.0  # of the lead picture: the steady state of long flights
 
 MADE = ("made", "How it was made")  # anchor and heading of the section at the end of every page
@@ -79,7 +79,7 @@ def write_page(
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    metadata = {p.name: {key: value for key, value in p.card.items() if key not in CARD_HIDES} for p in policies}
+    metadata = {p.name: {key: value for key, value in p.card.items() if key not in HIDDEN_METADATA} for p in policies}
     made = {
         "command": command,
         "versions": json.dumps(dict(versions), indent=1),

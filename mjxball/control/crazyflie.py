@@ -24,7 +24,7 @@ IDLE = 1000.0  # thrust below which the firmware stops the motors
 TILT_LIMIT = 15.0  # of every roll and pitch setpoint [deg]
 ATTITUDE_LIMITS = (20.0, 20.0, 360.0)  # of the attitude integrals of roll, pitch, yaw [deg s]
 RATE_LIMITS = (33.3, 33.3, 166.7)  # of the rate integrals [deg]
-LARGEST = 32767.0  # of a rate loop's output
+OUTPUT_LIMIT = 32767.0  # of a rate loop's output
 SIGNS = (1.0, -1.0, 1.0)  # ours -> firmware's roll, pitch, yaw
 TO_FIRMWARE = tuple(sign * 180.0 / math.pi for sign in SIGNS)  # ours [rad] -> firmware's [deg]
 # "pid_attitude.roll_kp" -> (field of `Autopilot`, place in it)
@@ -135,7 +135,7 @@ def cascade(
     rate_error = asked - turning
     rate_integral, output = _pid(inner, RATE_LIMITS, old.rate_integral, rate_error, turning - old.rates, integrals)
     output = output if rate_share is None else rate_share * output
-    output = _whole(clipped(output, -LARGEST, LARGEST), xp.trunc)
+    output = _whole(clipped(output, -OUTPUT_LIMIT, OUTPUT_LIMIT), xp.trunc)
     thrust = setpoint[..., 3]
     on = (thrust >= IDLE)[..., None]
     motors = mix(xp.minimum(thrust, float(THRUST_CEILING)), output, compensate)

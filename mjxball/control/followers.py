@@ -12,9 +12,7 @@ from mjxball.config import Config
 from mjxball.control.observation import OBSERVATION, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
 
-LARGEST = (
-    1e6  # bound of an observation's sum of absolute values, far beyond any flight and small enough for float32 filters
-)
+LARGEST = 1e6  # bound of an observation's sum of absolute values: far beyond any flight, fine for float32 filters
 
 
 class PrivilegedInfo(NamedTuple):

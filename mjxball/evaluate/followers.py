@@ -14,7 +14,7 @@ from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower, checked_command
 from mjxball.errors import FOREIGN, InputError, said
 
-LARGEST = 1e9  # of a command, in rad and m/s2; larger values soon overflow when squared
+MAX_COMMAND = 1e9  # of a command, in rad and m/s2; larger values soon overflow when squared
 PACKAGE = Path(__file__).parents[1]
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
@@ -30,10 +30,10 @@ def find_follower(text: str, flag: str) -> tuple[str, Make]:
     from mjxball.train.extensions import find  # with JAX
 
     made, name = find(text, flag), text.rpartition(":")[2]
-    return name, lambda config: _outside(name, made, config)
+    return name, lambda config: _user_follower(name, made, config)
 
 
-class Outside:
+class UserFollower:
     """A user's `Follower` whose answers are checked."""
 
     def __init__(self, name: str, answer: Any):
@@ -49,7 +49,7 @@ class Outside:
         return answered(self.name, _guarded(self.name, self._answer, copied, given=observation), observation)
 
 
-class OutsideLaw:
+class UserController:
     """A user's `Law` whose answers are checked."""
 
     def __init__(self, name: str, controller: Any):
@@ -70,13 +70,13 @@ class OutsideLaw:
         return answer[0], answered(self.name, answer[1], observation)
 
 
-def _outside(name: str, made: Any, config: Config) -> Follower:
+def _user_follower(name: str, made: Any, config: Config) -> Follower:
     found = _guarded(f"{name}(config)", made, config)
     has = {part for part in ("start", "step", "reset") if callable(_guarded(name, getattr, found, part, None))}
     if has >= {"start", "step"}:
-        return Baseline(OutsideLaw(name, found), config)
+        return Baseline(UserController(name, found), config)
     if callable(found) and "reset" in has:
-        return Outside(name, found)
+        return UserFollower(name, found)
     raise InputError(
         f"follower {name} has neither start and step nor reset and __call__; see docs/howto/own-baseline.md"
     )
@@ -100,8 +100,8 @@ def _is_ours(file: str) -> bool:
 
 
 def answered(name: str, command: Any, observation: np.ndarray) -> np.ndarray:
-    """`checked_command` of follower `name`; InputError also if it is not finite or exceeds `LARGEST`."""
+    """`checked_command` of follower `name`; InputError also if it is not finite or exceeds `MAX_COMMAND`."""
     found = checked_command(name, command, observation)
-    if not (np.abs(found) <= LARGEST).all():
-        raise InputError(f"follower {name} answered a number that is not finite, or larger than {LARGEST:g}")
+    if not (np.abs(found) <= MAX_COMMAND).all():
+        raise InputError(f"follower {name} answered a number that is not finite, or larger than {MAX_COMMAND:g}")
     return found

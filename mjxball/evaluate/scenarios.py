@@ -24,7 +24,7 @@ STANDARD = (
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.62, 1.0, 2.0, 3.1)),
 )
 MOST_SAMPLES = 100_000
-SLOWEST = 60.0  # longest usual time between two samples of a waveform [s]
+LONGEST_STEP = 60.0  # longest usual time between two samples of a waveform [s]
 
 
 def cross(
@@ -96,7 +96,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     times, offsets = zip(*samples, strict=True)
     if len(times) > 1:
         try:
-            for remark in check_times(times, longest=SLOWEST):
+            for remark in check_times(times, longest=LONGEST_STEP):
                 warn(f"waveform {path}: {remark}; the CG moves on a spline there")
         except ValueError as error:
             raise InputError(f"waveform {path}: {error}, a header not counted") from None
