@@ -93,8 +93,8 @@ def roll_of_quaternion(quaternion: Array) -> Array:
 def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
     """q exp(rotation / 2), normalised: turn `quaternion` (..., 4) by the body-axes vector `rotation` (..., 3) [rad].
 
-    The exponential's sine and cosine are Taylor sums in |rotation|^2, smooth at zero and exact to 1e-16
-    for |rotation| <= 0.5 rad, far beyond what one physics step turns.
+    The exponential's sine and cosine are Taylor sums in |rotation|^2, smooth at zero and exact to 1e-16 for |rotation|
+    <= 0.5 rad, far more than the rotation in one physics step.
     """
     xp = quaternion.__array_namespace__()
     h2 = dot(rotation, rotation)[..., None] / 4

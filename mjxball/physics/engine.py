@@ -60,7 +60,7 @@ def coordinates(value: Coordinates, directions: int) -> list[Scalar]:
 
 
 def joined(values: Sequence[Scalar]) -> Coordinates:
-    """The inverse of `coordinates`."""
+    """The inverse of `coordinates`: one coordinate as it is, two along the last axis."""
     return values[0] if len(values) == 1 else arrays.joined(values)
 
 

@@ -182,7 +182,7 @@ def _mass_matrix(model: Any, data: Any) -> Float[Array, "nv nv"]:
 
 
 def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:
-    """Solve M a = f for the root: 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
+    """Solve M a = f for a root of size 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
     if len(force) <= 2:
         return jnp.stack(solve_small(mass, force))
     total, coupling = mass[0, 0], mass[3:, :3]

@@ -47,7 +47,7 @@ class Trim(NamedTuple):
 
 
 class _Hover(NamedTuple):
-    """Equations of the forces of n acting rotors: effect @ force = wrench + weight * (CG offset along x, along y).
+    """Equations of the forces of n acting rotors: effect @ force = wrench + per_offset @ (CG offset along x, along y).
 
     Forces in units of their mean `unit`, moments in metres times that.
     """

@@ -189,7 +189,7 @@ def _random(disturbance: Disturbance, stream: int) -> np.random.Generator:
 def _recorded_errors(
     disturbance: Disturbance, shape: tuple[int, ...], period: float
 ) -> Float[np.ndarray, "count ... 18"] | None:
-    """Noise and estimator drift, in float32."""
+    """Noise plus estimator drift of all steps in float32, or None without either."""
     if not (disturbance.noise or disturbance.estimator_drift):
         return None
     white = _random(disturbance, 1).standard_normal((*shape, OBSERVATION_SIZE), np.float32)
@@ -201,7 +201,7 @@ def _recorded_errors(
 
 
 def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.ndarray, " count"] | None:
-    """True at the steps where a relayed message arrives; the first one always does."""
+    """(count,) true at the steps where a relayed message arrives; the first one always does."""
     if not disturbance.relay_rate:
         return None
     sent = np.floor(np.arange(count) * period * disturbance.relay_rate + 1e-9)
@@ -212,7 +212,7 @@ def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.nd
 
 
 def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndarray, "count 3"] | None:
-    """A first-order Gauss-Markov force [N] that starts in its steady state."""
+    """(count, 3) first-order Gauss-Markov force [N] that starts in its steady state."""
     if not disturbance.gust:
         return None
     return disturbance.gust * _walk(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
