@@ -71,8 +71,7 @@ class Tuning(NamedTuple):
 def motion(model: AssemblyModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """(a (18, 18), b (18, 3)) of x' = a x + b u; u is the sum of what all drones' commands ask for.
 
-    u is roll and pitch torque [N m] and the mean vertical acceleration [m/s2]. Attitude loops and rotor lag are part of
-    a.
+    u is roll and pitch torque [N m] and the mean vertical acceleration [m/s2]. a includes attitude loops and rotors.
     """
     a, b = np.zeros((STATES, STATES)), np.zeros((STATES, 3))
     for axis, (error, velocity, angle, rate, torque, load, growth) in enumerate(AXES):
@@ -95,11 +94,10 @@ def disturbance_filter(
     deviations: Mapping[int, float],
     scale: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Filter, np.ndarray]:
-    """(filter of the tilts and their torques, and of the lift if its error walks; (k, 18) its measurement matrix).
+    """(filter of the tilts and their torques, and of the lift if its error walks; (k, 18) its y from an observation).
 
-    States: for each of `axes` angle, rate, torque of the rotors, torque of the load and its rate; then climb
-    (downwards), lift and error of the lift. Its u is that of `motion`; `deviations` as from `noise`, `scale` as for
-    `Tuning.walks`. The matrix gives y from an observation.
+    States: for each of `axes` angle, rate, torque of the rotors, of the load, its rate; then climb downwards, lift,
+    error of the lift. Its u is that of `motion`; `deviations` as from `noise`, `scale` as for `Tuning.walks`.
     """
     states = [state for axis in axes for state in AXES[axis][2:]] + list(HEIGHT) * (tuning.lift_walk > 0.0)
     walks, measured = (

@@ -130,9 +130,8 @@ def with_curve(config: Config, curve: Curve) -> Config:
         autopilot=dataclasses.replace(autopilot, motor_curve=curve),
     )
     ratio = hover(config)[1] / hover(changed)[1]
-    roll, pitch, yaw = (
-        (ratio * p, ratio * i, ratio * d) for p, i, d in (autopilot.roll_rate, autopilot.pitch_rate, autopilot.yaw_rate)
-    )
+    loops = (autopilot.roll_rate, autopilot.pitch_rate, autopilot.yaw_rate)
+    roll, pitch, yaw = ((ratio * p, ratio * i, ratio * d) for p, i, d in loops)
     force = crazyflie.motor_force(autopilot.motor_curve, autopilot.hover_thrust)
     level = float(crazyflie.motor_command(curve, np.float64(force)))
     scaled = dataclasses.replace(

@@ -32,9 +32,8 @@ def gru_cell(hidden: Array, inputs: Array, kernel: Array, recurrent: Array, bias
 class Network(NamedTuple):
     """The network of a policy file, for inputs of any batch shape and array namespace.
 
-    Without `gru` an input (..., n) goes through ReLU layers. With it the last H values of the input are the GRU's
-    state: the first layer gets the next state and the normalised input, the last layer gets the layer below and that
-    state.
+    Without `gru` inputs (..., n) go through ReLU layers. With it their last H values are the GRU's state: the first
+    layer gets the next state and the normalised input, the last one the layer below and that state.
     """
 
     weights: Sequence[Array]

@@ -43,9 +43,9 @@ def asked_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (yaw torques (A, 4 N), commands (3 A, 4 N), commands at hover (3 A,)) of the A drones numbered `drones`.
 
-    The first rows times all rotor forces [N] are yaw torques [N m], which have to be 0. The second rows times the
-    forces, minus the commands at hover, are (roll, pitch, vertical) commands over their limits. `factor` (N,) is
-    `thrust` of `largest_margin`; `believes` (N,) is the mass that each drone's hover thrust assumes [kg].
+    Times all rotor forces [N], the first are yaw torques, which have to be 0; the second minus commands at hover are
+    (roll, pitch, vertical) commands over their limits. `factor` (N,) as `thrust` of `largest_margin`, `believes` (N,)
+    [kg] the mass that each drone's hover thrust assumes.
     """
     columns = 4 * plant.count
     if commands is None:

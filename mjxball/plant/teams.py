@@ -98,9 +98,8 @@ def amplitudes_with_loss(config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Object masses (M,) [kg] and CG amplitudes (S, N, M) [m] that can be held in every direction without drone n.
 
     Masses span `scenario.object_mass`. Amplitudes are those of the linear program of `plant.trim` with
-    `scenario.trim_margin` and the leader at its hover thrust. S counts `scenario.team_sizes`, or is 1 for the plant
-    alone; a ring's amplitude is divided by its size over the plant's. Negative: none, as without the leader. Needs
-    SciPy.
+    `scenario.trim_margin` and the leader at hover thrust. S counts `scenario.team_sizes`, or is 1 for the plant alone;
+    a ring's are divided by its size over the plant's. Negative: none, as without the leader. Needs SciPy.
     """
     from mjxball.plant.trim import largest_amplitude
 

@@ -1,10 +1,10 @@
 """Rotor forces that hold a load at hover, and the margin that they leave: a linear program for any plant.
 
 The assembly hovers level. The rotors that may act give the wrench about O that balances all weights without a yaw
-moment. A leader that does not act gives four equal forces for its own weight and its share of the load, which is what
-its controller commands at the goal. Let h be the share of the largest forces that lifting alone takes: a rotor of
-largest force F_max hovers at h F_max. A margin m keeps every rotor from both ends of its range by m times the distance
-from hover to that end:
+moment. A leader that does not act gives four equal forces for its own weight and its share of the load, as its
+controller commands at the goal. With h the share of the largest forces that lifting alone takes, a rotor of largest
+force F_max hovers at h F_max. A margin m keeps every rotor from both ends of its range by m times the distance from
+hover to that end:
 
     m h F_max <= F <= F_max - m (1 - h) F_max
 
@@ -174,14 +174,13 @@ def safe_radius(
     """CG distance from O (...) [m] up to which the followers trim the load in every direction; negative: not even at O.
 
     A closed form for training, on arrays of any batch shape and namespace, never larger than `largest_margin` allows
-    (ours). Every drone lifts its own share, with which most teams are level at c = 0. The load's moment is held in one
-    of two ways. F followers hold it by equal torques, at most 1 / (2 L F) of it on any rotor. Or they hold it along a
-    principal axis of their mounts' scatter C about their mean, by thrusts in proportion to their distances d from it,
-    at most |d| / (4 C) on any rotor. Weight that a weak or lost drone does not lift is shared equally by the others,
-    and its moment about their mean is held like the load's.
-
-    `thrust` (..., N) is the factor on each drone's forces. Drones that do not fly (`flies` (..., N) is 0) give nothing:
-    a lost one has to be lifted, one without mass is padding. The other arguments are those of `largest_margin`.
+    (ours). Every drone lifts its own share, with which most teams are level at c = 0. The F followers hold the load's
+    moment by equal torques, at most 1 / (2 L F) of it on any rotor; or along a principal axis of their mounts' scatter
+    C about their mean, by thrusts in proportion to their distances d from it, at most |d| / (4 C) on any rotor. Weight
+    that a weak or lost drone does not lift is shared equally by the others, and its moment about their mean is held
+    like the load's. `thrust` (..., N) is the factor on each drone's forces. Drones that do not fly (`flies` (..., N) is
+    0) give nothing: a lost one has to be lifted, one without mass is padding. The other arguments are those of
+    `largest_margin`.
     """
     xp = object_mass.__array_namespace__()
     count = parameters.size

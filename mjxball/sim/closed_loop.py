@@ -84,7 +84,7 @@ class ClosedLoop(Laws):
         the measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
         (`follower.residual_on_pid`), 0 for a follower whose command is complete. `physics` replaces the loop's physics.
         """
-        measured = self._leader_measurement(state, observation, goals[0])
+        measured = self._leader_body(state, observation, goals[0])
         commands = self._commands(measured, state.integral, follower, goals[0], on_pid)
         plant = (physics or self._physics)(state.plant, self.stack(*commands), load)
         diverged = state.diverged | has_diverged(plant)
@@ -104,9 +104,7 @@ class ClosedLoop(Laws):
         on_pid: Scalar | float = 1.0,
     ) -> Commands:
         """All commands at `observation`; arguments as for `step`."""
-        return self._commands(
-            self._leader_measurement(state, observation, goal), state.integral, follower, goal, on_pid
-        )
+        return self._commands(self._leader_body(state, observation, goal), state.integral, follower, goal, on_pid)
 
     def _commands(
         self, measured: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
@@ -120,7 +118,7 @@ class ClosedLoop(Laws):
             leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, integral), follower)
         )
 
-    def _leader_measurement(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
+    def _leader_body(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
         return self.body_from_observation(observation, goal) if self._leader_measures else state.plant
 
 

@@ -69,15 +69,13 @@ class ResetDistribution:
         self._in_plane, self._several = len(plant.directions) == 2, plant.count > 2
         sizes = scenario.team_sizes or (plant.count,)
         self._sizes = np.array(sizes)
-        self._table = teams.table(config) if scenario.team_sizes and not config.rigs.number else None
-        self._tables = rigs.training_rigs(config) if config.rigs.number and scenario.team_sizes else None
+        self._rings = teams.table(config) if scenario.team_sizes and not config.rigs.number else None
+        self._table = rigs.training_rigs(config) if config.rigs.number and scenario.team_sizes else None
         self._constants = constants = plant_parameters(config.plant, config.attitude)
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
         self._lever = 2 * min(map(abs, constants.mounts[:, plant.directions[0]]))
         self._integrates = config.follower.residual_on_pid and config.leader.tilt_integral_gain > 0
-        self._amplitudes_with_loss = (
-            teams.amplitudes_with_loss(config) if scenario.lost_follower_probability > 0 else None
-        )
+        self._loss_amplitudes = teams.amplitudes_with_loss(config) if scenario.lost_follower_probability > 0 else None
         self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
@@ -222,12 +220,12 @@ class ResetDistribution:
         plant, attitude = self.config.plant, self.config.attitude
         index = jax.random.randint(jax.random.fold_in(key, 1), (), 0, len(self._sizes)) if number is None else number
         index = index % len(self._sizes)
-        if self._tables is not None:
+        if self._table is not None:
             return self._random_row(jax.random.fold_in(key, 2), index)
         parameters = jax.tree.map(jnp.float32, self._constants)
         size = jnp.asarray(self._sizes, jnp.float32)[index]
-        if self._table is not None:
-            parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32)[index], self._table)
+        if self._rings is not None:
+            parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32)[index], self._rings)
         share, samples = size / plant.count, jax.random.uniform(key, (len(self._ranges),))
         factors = teams.Factors(*(low + (high - low) * u for (low, high), u in zip(self._ranges, samples, strict=True)))
         parameters = teams.varied(parameters, factors, attitude, share * attitude.design_object_mass)
@@ -237,7 +235,7 @@ class ResetDistribution:
     def _random_row(self, key: Array, index: Int[Array, ""]) -> Rig:
         """Any of the tabulated rigs of the size `index`."""
         number = jax.random.randint(key, (), 0, self.config.rigs.number)
-        return self._rig_of_row(jax.tree.map(lambda part: jnp.asarray(part, jnp.float32)[index, number], self._tables))
+        return self._rig_of_row(jax.tree.map(lambda part: jnp.asarray(part, jnp.float32)[index, number], self._table))
 
     def _rig_of_row(self, row: rigs.RigTable) -> Rig:
         flies = (jnp.arange(self.config.plant.count) < row.size).astype(jnp.float32)
@@ -269,11 +267,11 @@ class ResetDistribution:
         No rotor stops if no CG could be trimmed afterwards, unless `trim_margin` is negative; then the CG stays at O.
         """
         followers, scenario = np.array(self.config.plant.followers), self.config.scenario
-        masses, table = self._amplitudes_with_loss  # type: ignore[misc]
+        masses, table = self._loss_amplitudes  # type: ignore[misc]
         lost, which, when = jax.random.uniform(key, (3,))
         existing = len(followers) if rig is None else rig.flies[followers].sum()
         chosen = jnp.asarray(followers)[jnp.floor(which * existing).astype(jnp.int32)]
-        size = 0 if rig is None or self._table is None else jnp.argmin(jnp.abs(self._sizes - rig.flies.sum()))
+        size = 0 if rig is None or self._rings is None else jnp.argmin(jnp.abs(self._sizes - rig.flies.sum()))
         share, wide = (1.0, 1.0) if rig is None else (rig.size_ratio, rig.proportion)
         held = jnp.interp(load.object_mass / share, masses, jnp.asarray(table)[size, chosen]) * wide
         happens = (lost < scenario.lost_follower_probability) & ((held > 0) | (scenario.trim_margin < 0))

@@ -79,8 +79,7 @@ class Drawn(NamedTuple):
 
     rigs: RigTable
     draws: int
-    unstable: int  # rejected: attitude loop with rotor lag damped by less than LEAST_DAMPING, or rotors too weak for
-    # the slowest loop
+    unstable: int  # rejected: damping with rotor lag below LEAST_DAMPING, or rotors too weak for the slowest loop
     untrimmed: int  # rejected: CG reach too short even with believed mass and thrusts close to the truth
 
 
@@ -270,8 +269,7 @@ def trimmed_reach(
     """Distance of the CG from O (...) [m] that rotors and command limits of the followers can hold; negative: none.
 
     The smaller of `safe_radius` and what commands hold with the same `margin` of their limits (rad, m/s2) left. Tilt
-    commands hold the moments of the load and of uneven thrusts; vertical ones share equally what the leader does not
-    lift.
+    commands hold the moments of load and uneven thrusts; vertical ones share what the leader does not lift.
     """
     xp = load.__array_namespace__()
     rotors = safe_radius(parameters, 0, load, margin, believed, thrust)
