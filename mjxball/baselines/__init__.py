@@ -1,4 +1,4 @@
-"""Classical followers, by name. Their gains follow from the plant; all but `copy` are ours.
+"""Classical followers by name, with gains that follow from the plant; all but `copy` are ours.
 
 The adaptive controller that the paper compares with is not public. This package may use SciPy; `copy` lives in
 `control.followers`, which needs NumPy alone.
@@ -58,15 +58,15 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "mpc": Mpc,
     "lqg-known-failures": KnownFailuresLqg,
 }
-# Of benchmark suites. Where no drone fails `lqg-known-failures` is `lqg`; `mpc` needs an extra, and time.
+# In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
 SUITE_BASELINES = tuple(name for name in LAWS if name not in ("lqg-known-failures", "mpc"))
 FORMER_NAMES = {"lqg-told": "lqg-known-failures"}
 VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
-BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # of `eval.py`
+BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
 
 
 def make_law(name: str, config: Config) -> Law:
-    """The classical follower called `name` with the gains that follow from `config`; InputError if unknown."""
+    """The classical controller called `name` with gains that follow from `config`; InputError if unknown."""
     name = FORMER_NAMES.get(name, name)
     if name not in LAWS:
         raise InputError(f"unknown follower {name!r}; baselines are {', '.join(LAWS)}")
@@ -74,5 +74,5 @@ def make_law(name: str, config: Config) -> Law:
 
 
 def make_baseline(name: str, config: Config) -> Baseline:
-    """`make_law`, ready to fly."""
+    """The classical follower called `name` for `config`, with its state; InputError if unknown."""
     return Baseline(make_law(name, config), config)

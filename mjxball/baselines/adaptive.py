@@ -14,23 +14,23 @@ from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE
 
 BANDWIDTH = 6.0  # w_b [rad/s]; the loop limit-cycles from 16
-RATIO, TEAM_RATIO = 0.5, 1.0  # r of a pair's and of several followers
-MOMENT_LIMIT, RATE_LIMIT = 0.15, 0.3  # for each follower [kg m], [kg m/s]
-CRAZYFLIE_BANDWIDTH = 4.0  # of two Crazyflies; in the middle of 2 to 9 tried on random rigs; at 9 more crash [rad/s]
-CRAZYFLIE_RATE = 4.0  # what their load may change in a second over the largest that one tilt limit holds [1/s]
-MASS_GAIN, TEAM_MASS_GAIN = 0.5, 4.0  # Gamma of a pair's and of several followers
-MASS_SLOPE, MASS_LIMIT = 0.35, 0.5  # [1/s], for each follower [kg]
+RATIO, TEAM_RATIO = 0.5, 1.0  # r of a pair and of a team
+MOMENT_LIMIT, RATE_LIMIT = 0.15, 0.3  # per follower [kg m], [kg m/s]
+CRAZYFLIE_BANDWIDTH = 4.0  # for two Crazyflies [rad/s]; of 2 to 9 tried on random rigs; at 9 more crash
+CRAZYFLIE_RATE = 4.0  # largest rate of their load's moment over the moment that the tilt limit holds [1/s]
+MASS_GAIN, TEAM_MASS_GAIN = 0.5, 4.0  # Gamma of a pair and of a team
+MASS_SLOPE, MASS_LIMIT = 0.35, 0.5  # [1/s], per follower [kg]
 CORRECTION_LIMIT = 0.5  # [rad] of roll and pitch, with mass adaptation
 
 
-class State(NamedTuple):
-    """State of the adaptive follower, in body axes; A axes about which the load turns the assembly."""
+class AdaptiveState(NamedTuple):
+    """State of the adaptive follower, in body axes; A is the number of axes about which the load acts."""
 
     integral: Any  # (..., 3) see `CopiedPid`
-    desired: Array  # (..., A) last command of the copied law about the load's axes [rad]
+    desired: Array  # (..., A) last tilt command of the copied PID about the load's axes [rad]
     moment: Array  # (..., A) estimate of the load's torque about them over gravity, m_o c for pitch [kg m]
     rate: Array  # (..., A) estimate of its rate [kg m/s]
-    extra_mass: Array  # (...) estimate of the object's mass beyond what is believed [kg]
+    extra_mass: Array  # (...) estimated mass of the object minus the believed mass [kg]
     error: Array  # (...) height error of an ideal PD response [m]
     error_rate: Array  # (...) [m/s]
     started: Array  # (...) 1 after the first step
@@ -40,14 +40,14 @@ class Adaptive:
     """s = (q - theta_d') + lam (theta - theta_d); d' = v + G1 (g + az) s, v' = G2 (g + az) s, about each load's axis.
 
     theta_d is the copied command, lam = Kp / Kd of a drone's attitude loop, K = N Kd of all N drones, G1 = K w_b / g^2,
-    G2 = G1 w_b r / 2. Every follower gives its share against the torque (g + az) d, by its rotors and by lifting more
-    or less than the others (`AssemblyModel.corrections`): the one of a pair theta_f = theta_d - (g + az) d / Kp. With
-    `adapts_mass` the object's mass is estimated from the height against an ideal PD response, and the followers lift
-    its weight without turning the assembly. The other axis of a pair is copied. A leader that integrates is copied with
-    its integral, so that all lift alike; what a Crazyflie's motors lift besides when they work apart is taken off.
+    G2 = G1 w_b r / 2. The followers share a torque against (g + az) d, by rotor torque and by unequal lift
+    (`AssemblyModel.corrections`); for a pair theta_f = theta_d - (g + az) d / Kp. With `adapts_mass` the object's mass
+    is estimated from the height relative to an ideal PD response, and the followers lift its weight without a moment.
+    The other axis of a pair is copied. If the leader has an integral, it is copied too, so that all lift alike. The
+    extra thrust of Crazyflie motors at unequal commands is subtracted.
 
-    Of several followers r = 1 and Gamma = 4 were best among r of 0.5 and 1, w_b of 4 to 12 and Gamma of 0.5 to 16: at
-    r = 0.5 the largest error is up to twice as large, and at w_b = 8 they diverge under noise and 40 ms of delay.
+    For teams r = 1 and Gamma = 4 were best among r of 0.5 and 1, w_b of 4 to 12 and Gamma of 0.5 to 16: at r = 0.5 the
+    largest error is up to twice as large, and at w_b = 8 they diverge under noise and 40 ms of delay.
     """
 
     needs_privileged = False
@@ -70,15 +70,15 @@ class Adaptive:
         self._mass_gain = (MASS_GAIN if followers == 1 else TEAM_MASS_GAIN) / model.gravity
         self._mass_limit = followers * MASS_LIMIT
 
-    def start(self, observation: Array) -> State:
+    def start(self, observation: Array) -> AdaptiveState:
         """See `Law.start`."""
         xp, observation = observation.__array_namespace__(), self._model.seen(observation)
         zero = xp.zeros_like(observation[..., 0])
         zeros = xp.zeros_like(observation[..., : len(self._model.axes)])
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
-        return State(self._pid.start(observation), zeros, zeros, zeros, zero, error, error_rate, zero)
+        return AdaptiveState(self._pid.start(observation), zeros, zeros, zeros, zero, error, error_rate, zero)
 
-    def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
+    def step(self, state: AdaptiveState, observation: Array, privileged: PrivilegedInfo) -> tuple[AdaptiveState, Array]:
         """See `Law.step`."""
         xp, model, axes = observation.__array_namespace__(), self._model, self._model.turned
         slope, first, second = (xp.asarray(gain, dtype=observation.dtype) for gain in self._gains)
@@ -92,13 +92,13 @@ class Adaptive:
         most, most_rate = self._estimate_limits
         moment = xp.clip(state.moment + model.period * (state.rate + first * weight * s), -most, most)
         moment_rate = xp.clip(state.rate + model.period * second * weight * s, -most_rate, most_rate)
-        moved = state._replace(
+        after = state._replace(
             integral=integral, desired=desired, moment=moment, rate=moment_rate, started=xp.ones_like(state.started)
         )
         carried, lift = model.carried(model.of_flight(privileged.believed_mass)), xp.zeros_like(vertical)
         if self._adapts_mass:
-            moved = self._mass(moved, observation, carried)
-            lift = model.gravity * moved.extra_mass
+            after = self._mass(after, observation, carried)
+            lift = model.gravity * after.extra_mass
         wrench = xp.concat([lift[..., None], model.on_axes(-weight * moment)], axis=-1)
         correction = model.corrections(wrench, carried)
         tilt = correction[..., :2]
@@ -106,10 +106,10 @@ class Adaptive:
             tilt = xp.clip(tilt, -CORRECTION_LIMIT, CORRECTION_LIMIT)
         lift = model.less_extra_lift(vertical[..., None] + correction[..., 2], tilt)
         command = xp.concat([copied[..., None, :2] + tilt, lift[..., None]], axis=-1)
-        return moved, model.sent(clip_command(command, *self._limits))
+        return after, model.sent(clip_command(command, *self._limits))
 
-    def _mass(self, state: State, observation: Array, carried: Array) -> State:
-        """`state` with the extra mass that explains the height, for drones that believe to have `carried` (..., N)."""
+    def _mass(self, state: AdaptiveState, observation: Array, carried: Array) -> AdaptiveState:
+        """`state` with the extra mass that explains the height; `carried` (..., N) are the drones' assumed masses."""
         xp, period = observation.__array_namespace__(), self._model.period
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
         s = (state.error_rate - error_rate) + MASS_SLOPE * (state.error - error)

@@ -1,6 +1,6 @@
-"""LQG for two Crazyflies on a stick along y, on a linear model with their cascades and the leader's PID (ours).
+"""LQG for two Crazyflies on a stick along y, from a linear model with their cascades and the leader's PID (ours).
 
-Every quantity is a deviation from the level hover at the goal; angles and torques are about body x.
+All quantities are deviations from the level hover at the goal; angles and torques are about body x.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
 
-# What costs 1: states and the follower's commands in their units, and the commands' change in a second.
+# Values with a cost of 1: states and commands of the follower in their units, and the rates of its commands.
 COSTS = {"y": 0.1, "vy": 0.5, "height": 0.1, "climb": 0.5, "rate": 3.0}
 LOAD_COST = 1e-2  # of a rolling ball's torque [N m]
 THRUST_DIFFERENCE, TILT = 0.05, 0.5  # thrust difference [N], roll command [rad]
 CHANGES = (2.0, 20.0)  # [rad/s], [m/s3]
-# Intensities of the noise that drives a state, as a deviation after one second.
+# Process noise of a state, as its standard deviation after one second.
 PROCESS_NOISE = {"load_rate": 0.2, "load": 1e-3, "lift": 0.02, "rate": 0.1, "vy": 0.1, "climb": 0.1}
-ROLLING_NOISE = 2e-3  # of `load_rate` where a ball that rolls by itself is part of the model
-# Of what is measured: the place in an observation, its sign, the standard deviation.
+ROLLING_NOISE = 2e-3  # of `load_rate` if the model includes a rolling ball
+# Measured states: index in an observation, sign, standard deviation of the noise.
 MEASURED = {
     "y": (13, -1.0, 3e-3),
     "vy": (16, -1.0, 2e-2),
@@ -51,11 +51,11 @@ STATES = (
     "leader_thrust",  # [N]
     "follower_thrust",  # [N]
     "leader_integral",  # integral of the leader's height error [m s]
-    "load",  # torque disturbance: the ball, unequal rotors [N m]
+    "load",  # disturbance torque: the ball, unequal rotors [N m]
     "load_rate",  # its rate [N m/s]
-    "lift",  # disturbance force: weight and rotors other than believed [N]
+    "lift",  # disturbance force: errors of mass and thrust [N]
 )
-LATERAL = ("y", "vy")  # what a stand locks
+LATERAL = ("y", "vy")  # states that a stand locks
 LOAD_DECAY, LOAD_RATE_DECAY = 0.02, 1.0  # assumed decay of a load or lift, and of a load's rate [1/s]
 ROLLING = 5 / 7  # acceleration of a rolling ball over that of a sliding one
 
@@ -70,13 +70,13 @@ class LinearModel(NamedTuple):
     load_limit: float  # [N m]
 
     def indices(self, names: Iterable[str]) -> list[int]:
-        """Indices in x of those of `names` that the model has."""
+        """Indices in x of those `names` that the model has."""
         return [self.names.index(name) for name in names if name in self.names]
 
 
 def linear_model(config: Config, delay: float) -> LinearModel:
-    """The model for the nominal plant of `config`; `delay` [s] of the sensors is added to the rotors' lag."""
-    plant, law = config.plant, config.leader
+    """The model for the plant of `config`; `delay` [s] of the sensors is added to the rotors' lag."""
+    plant, leader = config.plant, config.leader
     assembly, loop = assembly_model(config, "lqg"), drone_loop(config, 0)
     lag, half = plant.rotor_lag + delay, 0.5 * float(assembly.mounts[0, 1] - assembly.mounts[1, 1])
     n, at = len(STATES), {name: place for place, name in enumerate(STATES)}
@@ -84,10 +84,10 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     row = {name: eye[place] for name, place in at.items()}
     a, b = np.zeros((n, n)), np.zeros((n, 2))
     free = float(plant.stand == "free")
-    tilt = half if law.error == "own" else 0.0  # the leader sees its own height
+    tilt = half if leader.error == "own" else 0.0  # the leader measures its own height
     leader_height, leader_climb = row["height"] + tilt * row["roll"], row["climb"] + tilt * row["rate"]
-    leader_roll = free * (law.kp[1] * row["y"] + law.kd[1] * row["vy"]) / plant.gravity
-    leader_vertical = law.ki[2] * row["leader_integral"] - law.kp[2] * leader_height - law.kd[2] * leader_climb
+    leader_roll = free * (leader.kp[1] * row["y"] + leader.kd[1] * row["vy"]) / plant.gravity
+    leader_vertical = leader.ki[2] * row["leader_integral"] - leader.kp[2] * leader_height - leader.kd[2] * leader_climb
 
     a[at["y"]], a[at["vy"]] = row["vy"], -plant.gravity * row["roll"]
     a[at["roll"]] = row["rate"]
@@ -120,8 +120,8 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     return LinearModel(a[np.ix_(indices, indices)], b[indices], tuple(names), loop.integral_limit, limit)
 
 
-class State(NamedTuple):
-    """State of the controller."""
+class LqgState(NamedTuple):
+    """State of the controller between control steps."""
 
     expected: Array  # (..., n) states of the model, see `Filter`
     command: Array  # (..., 2) last roll [rad] and vertical acceleration [m/s2]
@@ -129,7 +129,7 @@ class State(NamedTuple):
 
 
 class CrazyflieLqg:
-    """Kalman filter and LQR of the pair's roll and height; about pitch, which no load turns, the leader is copied."""
+    """Kalman filter and LQR of the pair's roll and height; pitch, which the load does not move, copies the leader."""
 
     name = "lqg"
     needs_privileged = False
@@ -141,34 +141,34 @@ class CrazyflieLqg:
         self._model = linear_model(config, DELAY)
         self._filter, self._change = design(self._model, config.timing.control_period)
         self._pid = CopiedPid(config)
-        shown = [MEASURED[name][:2] for name in MEASURED if name in self._model.names]
-        self._shown = np.array([sign * np.eye(OBSERVATION_SIZE)[place] for place, sign in shown])  # y of an observation
+        places = [MEASURED[name][:2] for name in MEASURED if name in self._model.names]
+        self._measurement = np.array([sign * np.eye(OBSERVATION_SIZE)[place] for place, sign in places])  # (k, 18)
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         limits = self._model.rate_integral_limit, self._model.load_limit
         self._state_bounds = self._bounds(("rate_integral", "load"), limits)
         self._error_bounds = self._bounds(("y", "height"), ERROR_LIMIT)
 
-    def start(self, observation: Array) -> State:
+    def start(self, observation: Array) -> LqgState:
         """See `Law.start`."""
         zero = observation.__array_namespace__().zeros_like(observation[..., :2])
-        return State(self._filter.start(times(self._shown, observation)), zero, self._pid.start(observation))
+        return LqgState(self._filter.start(times(self._measurement, observation)), zero, self._pid.start(observation))
 
-    def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
+    def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
         """See `Law.step`."""
         xp = observation.__array_namespace__()
-        estimate = self._filter.corrected(state.expected, times(self._shown, observation))
+        estimate = self._filter.corrected(state.expected, times(self._measurement, observation))
         estimate = _clip(estimate, self._state_bounds)
-        near = _clip(estimate, self._error_bounds)  # the motors have little to spare for a far goal
+        near = _clip(estimate, self._error_bounds)  # the motors have too little thrust to spare for large errors
         change = times(self._change, xp.concat([near, state.command], axis=-1))
         command = _clip(state.command - change, self._limits)
         integral, copied = self._pid.step(state.integral, observation)
         vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
         vertical = _clip(vertical, self._limits[1])
         sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
-        return State(self._filter.moved(estimate, command), command, integral), sent
+        return LqgState(self._filter.moved(estimate, command), command, integral), sent
 
     def _bounds(self, names: tuple[str, ...], limits: Any) -> np.ndarray:
-        """(n,) the `limits` of the states `names` that the model has, infinite for the others."""
+        """Bounds (n,): `limits` for the states `names` that the model has, infinity for the others."""
         bounds = np.full(len(self._model.names), np.inf)
         bounds[self._model.indices(names)] = limits
         return bounds
@@ -181,7 +181,7 @@ def _clip(array: Array, limit: Any) -> Array:
 
 
 def design(model: LinearModel, period: float) -> tuple[Filter, np.ndarray]:
-    """(filter, (2, n + 2) K of a command's change -K (x, u)) for the control period [s]."""
+    """(filter, gain (2, n + 2) K of the command's change -K (x, u)) for the control `period` [s]."""
     n, names = len(model.names), model.names
     transition, drive = discretise(model.a, model.b, period)
     rolls = bool(np.isfinite(model.load_limit))

@@ -1,4 +1,4 @@
-"""What a linear law is made of: a sampled model, a steady-state Kalman filter, regulators of least quadratic cost."""
+"""Building blocks of linear controllers: sampled models, steady-state Kalman filters, LQR gains."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from mjxball.arrays import Array, matmul
 
 
 class Filter(NamedTuple):
-    """Steady-state Kalman filter of x <- A x + B u, of which y is measured: x <- x + K (y - C x).
+    """Steady-state Kalman filter of x <- A x + B u with the measurement y: x <- x + K (y - C x).
 
-    What is remembered is the state x (..., n) expected at the next measurement.
+    Its state is the x (..., n) predicted for the next measurement.
     """
 
     transition: Array  # A (n, n)
@@ -23,20 +23,20 @@ class Filter(NamedTuple):
     measured: Array  # C (k, n)
 
     def start(self, y: Array) -> Array:
-        """State (..., n) at the first measurement `y` (..., k): 0 where nothing is measured."""
+        """State (..., n) at the first measurement `y` (..., k); states that are not measured are 0."""
         return times(self.measured.T, y)
 
     def corrected(self, x: Array, y: Array) -> Array:
-        """The expected state `x` (..., n) after the measurement `y` (..., k)."""
+        """The predicted state `x` (..., n) corrected by the measurement `y` (..., k)."""
         return x + times(self.gain, y - times(self.measured, x))
 
     def moved(self, x: Array, u: Array) -> Array:
-        """The state a period after `x` (..., n), in which `u` (..., m) acts."""
+        """The state predicted one period after `x` (..., n) with the input `u` (..., m)."""
         return times(self.transition, x) + times(self.drive, u)
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """(..., k) of (..., k, n) and (..., n) in the type of `vector`, the same for one as for many."""
+    """Product (..., k) of `matrix` (..., k, n) and `vector` (..., n), in the dtype of `vector`; equal for any batch."""
     matrix = vector.__array_namespace__().asarray(matrix, dtype=vector.dtype)
     return matmul(matrix, vector[..., None])[..., 0]
 
@@ -51,10 +51,10 @@ def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray,
 def kalman(
     transition: np.ndarray, drive: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
 ) -> Filter:
-    """The filter of x <- A x + B u every `period` [s], for `transition` A and `drive` B.
+    """The filter of x <- A x + B u every `period` [s], with `transition` A and `drive` B.
 
-    `walks`: intensity of the white noise that drives a state, by its number. `noise`: deviation of the measurement of
-    a state, by its number, in the order in which they are measured.
+    `walks` maps the index of a state to the intensity of its process noise. `noise` maps the index of a measured state
+    to the standard deviation of its measurement, in the order of the measurements.
     """
     process_noise = np.zeros_like(transition)
     for state, intensity in walks.items():
@@ -66,9 +66,9 @@ def kalman(
 
 
 def regulator(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K (m, n) of u = -K x that minimises the sum of x'Qx + u'Ru, W (m, m)) for x <- A x + B u.
+    """(K (m, n) of the u = -K x that minimises the sum of x'Qx + u'Ru, W (m, m)) for x <- A x + B u.
 
-    A correction v of u costs v'Wv on top, whenever it is made.
+    A deviation v from that u adds v'Wv to the cost, at whatever time it is made.
     """
     value = riccati(a, b, q, r)
     cost = r + b.T @ value @ b
@@ -84,7 +84,7 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.nd
     """P (n, n) = A'PA - A'PB (R + B'PB)^-1 B'PA + Q, by structure-preserving doubling.
 
     Not `scipy.linalg.solve_discrete_are`: on the stand the leader's rate integral and the ball's torque conserve a sum
-    that no command moves (an eigenvalue of 1), so there is no stabilising solution to a solver of eigenvalues. SciPy's
+    that no command changes (an eigenvalue of 1), so that eigenvalue solvers find no stabilising solution. SciPy's
     feedback is then off by 9e-4, and with a decay of 1e-5 1/s it fails; doubling converges to the least cost. Elsewhere
     both agree to 1e-12.
     """

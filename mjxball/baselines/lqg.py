@@ -1,7 +1,7 @@
-"""LQG for plants with ideal loops: the followers take over the loop by LQR and Kalman filters for what disturbs (ours).
+"""LQG for plants with ideal attitude loops: LQR on the motion, Kalman filters for the disturbances (ours).
 
-The assembly follows the sum of all drones' commands. The followers therefore command what N drones should do less the
-leader's command, which they compute from what they see, each its part.
+The assembly follows the sum of all drones' commands. The followers therefore command what N drones should do minus the
+leader's command, which they compute from their observation, in equal shares.
 """
 
 from __future__ import annotations
@@ -19,37 +19,37 @@ from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import copy_command
 from mjxball.plant import plant_parameters
 
-CORRECTION_LIMIT = 0.6  # of all followers' roll and pitch against the load's torque [rad]
-LIMITS = (1.0, 0.6)  # of a command, about an axis that the load turns and about another [rad]
+CORRECTION_LIMIT = 0.6  # of each follower's roll and pitch against the load's torque [rad]
+LIMITS = (1.0, 0.6)  # of a command about an axis with a load torque and about another [rad]
 # QUICK reproduces an independent simulation; with delayed commands it limit-cycles. SLOW settles earliest under noise
-# and 40 ms of delay among the sets that settle in every case (docs/archive/training.md).
+# and 40 ms of delay among those that settle in every case (docs/archive/training.md).
 QUICK = Tuning(position=0.25, velocity=1.0, height=0.25, climb=1.0, torque_walk=9.0, tilt_limit=0.25)
 SLOW = Tuning(position=0.15, velocity=0.6, height=0.15, climb=0.6, torque_walk=0.003)
 OFFSET_FREE = Tuning(position=0.2, velocity=0.6, height=0.2, climb=0.6, torque_walk=0.003, lift_walk=0.01)
 
 
-class Takeover:
-    """What `lqg` and `memoryless` share: everything but how the load's torque d is found."""
+class LqrFollower:
+    """Base of `lqg` and `memoryless`, which differ in how they estimate the load's torque d."""
 
     needs_privileged = False
     name = ""
     tuning = QUICK
-    limits: tuple[float, float] | None = LIMITS  # None: those of the leader
+    limits: tuple[float, float] | None = LIMITS  # None: the leader's
 
     def __init__(self, config: Config):
-        self._law = copy_gains(config)
+        self._leader_gains = copy_gains(config)
         self._model = model = ideal_model(config, self.name)
         self._gains = position_gains(model, self.tuning)
-        self._far = np.array([self.tuning.tilt_limit, self.tuning.tilt_limit, self.tuning.lift_limit])
+        self._position_limits = np.array([self.tuning.tilt_limit, self.tuning.tilt_limit, self.tuning.lift_limit])
         turned, other = self.limits or (config.command.tilt_limit,) * 2
         tilts = [turned if axis in model.axes else other for axis in (0, 1)]
-        self._largest = CORRECTION_LIMIT * model.followers * np.array(model.kp)
+        self._torque_limits = CORRECTION_LIMIT * model.followers * np.array(model.kp)
         self._limits = np.array([*tilts, config.command.vertical_limit])
 
     def _desired(self, observation: Array) -> Array:
-        """What the assembly should do: roll, pitch, vertical acceleration (..., 3)."""
+        """Desired roll, pitch and vertical acceleration (..., 3) of the assembly."""
         xp, (far, back) = observation.__array_namespace__(), (times(gains, observation) for gains in self._gains)
-        limit = xp.asarray(self._far, dtype=far.dtype)
+        limit = xp.asarray(self._position_limits, dtype=far.dtype)
         return xp.clip(far, -limit, limit) + back
 
     def _plan(
@@ -57,73 +57,74 @@ class Takeover:
     ) -> tuple[Array, Array]:
         """Commands (..., F, 3) for `desired` (..., 3) against a `torque` (..., A) [N m] and a `lift` (...) [m/s2].
 
-        Beside them what the commands of all ask for (..., 3), as the u of `motion`.
+        Also the sum of what all commands ask for (..., 3), which is u of `motion`.
 
-        The followers lift alike. On top each gives its share of the torque that the assembly wants and the leader does
-        not give: its N attitude loops at `desired`, against the load and against thrusts that are uneven.
+        All followers lift alike. Each adds its share of the torque that the assembly needs and the leader does not
+        give: N attitude loops at `desired`, against the load and against unequal thrusts.
         """
         xp, model, count = observation.__array_namespace__(), self._model, len(self._model.own_mass)
-        kp, kd, limits, most = (
-            xp.asarray(part, dtype=observation.dtype) for part in (model.kp, model.kd, self._limits, self._largest)
+        kp, kd, limits, torque_limits = (
+            xp.asarray(part, dtype=observation.dtype)
+            for part in (model.kp, model.kd, self._limits, self._torque_limits)
         )
         thrust = self._thrust(privileged)
         carried = model.carried(self._believed(observation, privileged))
-        given = xp.ones_like(carried) if thrust is None else thrust
-        lifting, level = given * carried, xp.cos(observation[..., 3]) * xp.cos(observation[..., 4])
-        led, first = copy_command(observation, *self._law), given[..., model.leader, None]
+        factor = xp.ones_like(carried) if thrust is None else thrust
+        lifting, level = factor * carried, xp.cos(observation[..., 3]) * xp.cos(observation[..., 4])
+        led, leader_factor = copy_command(observation, *self._leader_gains), factor[..., model.leader, None]
 
-        left = self._weighing(carried, privileged) * (model.gravity + desired[..., 2] - lift)
+        left = self._lifted_mass(carried, privileged) * (model.gravity + desired[..., 2] - lift)
         left = left - lifting[..., model.leader] * (model.gravity + led[..., 2])
-        alike = xp.clip(left / model.of_followers(lifting).sum(axis=-1) - model.gravity, -limits[2], limits[2])
-        # Where the rotors of a drone that is commanded there give no torque.
+        vertical = xp.clip(left / model.of_followers(lifting).sum(axis=-1) - model.gravity, -limits[2], limits[2])
+        # The tilt command at which a drone's attitude loop asks for no torque.
         rest = observation[..., 3:5] + kd / kp * observation[..., 9:11]
-        base = xp.concat([rest, alike[..., None]], axis=-1)[..., None, :]
+        base = xp.concat([rest, vertical[..., None]], axis=-1)[..., None, :]
         base = xp.broadcast_to(base, (*base.shape[:-2], model.followers, 3))
         turns = self._lever_torque(led, base, lifting, level)[..., model.turned] + torque
-        wanted = kp * (count * (desired[..., :2] - rest) - first * (led[..., :2] - rest))
-        wanted = wanted - xp.clip(model.on_axes(turns), -most, most)
-        wrench = xp.concat([0.0 * wanted[..., :1], wanted], axis=-1)
+        torque_left = kp * (count * (desired[..., :2] - rest) - leader_factor * (led[..., :2] - rest))
+        torque_left = torque_left - xp.clip(model.on_axes(turns), -torque_limits, torque_limits)
+        wrench = xp.concat([0.0 * torque_left[..., :1], torque_left], axis=-1)
         followed = self._limited(base, base + model.corrections(wrench, carried, thrust), carried, limits)
 
-        angles = first * led[..., :2] + (model.of_followers(given)[..., None] * followed[..., :2]).sum(axis=-2)
-        # The filter knows N loops; what drones do not give of theirs is taken off.
-        commanded = kp * (angles + (count - given.sum(axis=-1))[..., None] * rest)
+        angles = leader_factor * led[..., :2] + (model.of_followers(factor)[..., None] * followed[..., :2]).sum(axis=-2)
+        # The filter's model has N loops at full thrust; the torque that weak drones do not give is subtracted.
+        commanded = kp * (angles + (count - factor.sum(axis=-1))[..., None] * rest)
         turning = commanded + self._lever_torque(led, followed, lifting, level)
         mean = (led[..., 2] + followed[..., 2].sum(axis=-1)) / count
         return followed, xp.concat([turning, mean[..., None]], axis=-1)
 
     def _believed(self, observation: Array, privileged: PrivilegedInfo) -> Array:
-        """Mass (...) of the object that each drone takes its share of [kg]."""
+        """Believed mass (...) of the object, shared by all drones [kg]."""
         return self._model.of_flight(privileged.believed_mass)
 
     def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
-        """What drones give of what they are asked for (..., N), if that is known."""
+        """Factors (..., N) on the drones' thrust, or None if they are unknown."""
         return None
 
     def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
-        """Commands `followed` (..., F, 3) within what may be sent; at `base` (..., F, 3) rotors only lift."""
+        """Commands `followed` (..., F, 3) clipped to the limits; at `base` (..., F, 3) rotors give no torque."""
         return followed.__array_namespace__().clip(followed, -limits, limits)
 
-    def _weighing(self, carried: Array, privileged: PrivilegedInfo) -> Array:
-        """Mass (...) that all drones lift, as far as it is known, of what each believes to carry (..., N) [kg]."""
+    def _lifted_mass(self, carried: Array, privileged: PrivilegedInfo) -> Array:
+        """Mass (...) that all drones lift [kg]: here the sum of those that each assumes, `carried` (..., N)."""
         return carried.sum(axis=-1)
 
-    def _in_order(self, led: Array, followed: Array) -> Array:
+    def _all_commands(self, led: Array, followed: Array) -> Array:
         """Commands of all drones (..., N, 3)."""
         place = self._model.leader
         parts = [followed[..., :place, :], led[..., None, :], followed[..., place:, :]]
         return led.__array_namespace__().concat(parts, axis=-2)
 
     def _lever_torque(self, led: Array, followed: Array, lifting: Array, level: Array) -> Array:
-        """(..., 2) roll and pitch torque about O of all thrusts less the drones' own weight."""
+        """Roll and pitch torque (..., 2) about O of all thrusts minus the weights of the drones."""
         xp, model = led.__array_namespace__(), self._model
         own = xp.asarray(model.own_mass, dtype=led.dtype) * model.gravity
-        asked = model.gravity + self._in_order(led, followed)[..., 2]
+        asked = model.gravity + self._all_commands(led, followed)[..., 2]
         return model.lever_torque(lifting * asked / level[..., None] - own)
 
 
-class Memoryless(Takeover):
-    """d from the balance of torques at standstill: N Kp (theta - theta*) + N Kd q."""
+class Memoryless(LqrFollower):
+    """d from the torque balance at standstill: N Kp (theta - theta*) + N Kd q."""
 
     name = "memoryless"
 
@@ -143,30 +144,30 @@ class Memoryless(Takeover):
         return state, model.sent(followed)
 
 
-class Lqg(Takeover):
+class Lqg(LqrFollower):
     """d from a steady-state Kalman filter on angle, rate, d, d' and the rotors' torque about each of the load's axes.
 
-    With a `lift_walk` the filter also finds the vertical acceleration that nobody commanded, as of a mass that is not
-    the believed one. The state (..., n) is the filter's.
+    With a `lift_walk` the filter also estimates an uncommanded vertical acceleration, as from an error of the mass. The
+    state (..., n) is the filter's.
     """
 
     name = "lqg"
-    scaled = False  # a load's torque is expected to wander as much as that of the pair, whatever the inertia is
+    scaled = False  # whether the process noise of the load's torque scales with the inertia
 
     def __init__(self, config: Config):
         super().__init__(config)
         model = self._model
         roll, pitch = (inertia / PAIR_INERTIA if self.scaled else 1.0 for inertia in model.inertia)
         found = disturbance_filter(model, model.axes, self.tuning, noise(), (roll, pitch))
-        self._filter, self._shown = found
+        self._filter, self._measurement = found
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
-        return self._filter.start(times(self._shown, self._model.seen(observation)))
+        return self._filter.start(times(self._measurement, self._model.seen(observation)))
 
     def estimate(self, state: Array, observation: Array) -> tuple[Array, Array, Array]:
-        """(the filter's state (..., n), torque of the load (..., A) [N m], error of the lift (...) [m/s2])."""
-        x, turns = self._filter.corrected(state, times(self._shown, observation)), 5 * len(self._model.axes)
+        """(the filter's state (..., n), load torque (..., A) [N m], error of the lift (...) [m/s2])."""
+        x, turns = self._filter.corrected(state, times(self._measurement, observation)), 5 * len(self._model.axes)
         return x, x[..., 3:turns:5], x[..., -1] if self.tuning.lift_walk > 0.0 else 0.0
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
@@ -178,14 +179,14 @@ class Lqg(Takeover):
 
 
 class SlowLqg(Lqg):
-    """The same with a filter that is slow enough for noise and late commands."""
+    """`lqg` with a slower filter, for noise and delay."""
 
     name = "lqg-slow"
     tuning = SLOW
 
 
 class OffsetFree(Lqg):
-    """`lqg` for a pair whose mass nobody knows; it is not told what mass is believed, and keeps the leader's limits."""
+    """`lqg` for a pair of unknown object mass: it ignores the believed mass and keeps the leader's limits."""
 
     name = "lqg-offset-free"
     tuning = OFFSET_FREE
@@ -197,7 +198,7 @@ class OffsetFree(Lqg):
         self._mass = config.plant.object_mass
 
     def start(self, observation: Array) -> Array:
-        """See `Law.start`; the filter begins a period late."""
+        """See `Law.start`; the filter starts one period late."""
         found = super().start(observation)
         return self._filter.moved(found, 0.0 * observation[..., :3])
 
@@ -206,7 +207,7 @@ class OffsetFree(Lqg):
 
 
 class KnownFailuresLqg(Lqg):
-    """`lqg` that also knows what every drone gives of its thrust: which have failed, and when."""
+    """`lqg` that also knows the factor on every drone's thrust, and so which have failed."""
 
     name = "lqg-known-failures"
     needs_privileged = True
@@ -216,10 +217,10 @@ class KnownFailuresLqg(Lqg):
 
 
 class KnownRigLqg(KnownFailuresLqg):
-    """`lqg` that knows everything of its rig but where the CG is: `config` is the rig's, the true mass included.
+    """`lqg` that knows its rig and the true mass, which `config` has, but not where the CG is.
 
-    The load's torque is expected to wander in proportion to the assembly's inertia, so that one tuning serves rigs of
-    all sizes, and no command asks rotors for more torque than they have.
+    The process noise of the load's torque scales with the assembly's inertia, so that one tuning serves rigs of all
+    sizes. No command asks rotors for more torque than they have.
     """
 
     name = "lqg-known-rig"
@@ -227,10 +228,10 @@ class KnownRigLqg(KnownFailuresLqg):
 
     def __init__(self, config: Config):
         super().__init__(config)
-        numbers, followers = plant_parameters(config.plant, config.attitude), list(config.plant.followers)
-        self._rotors = numbers.arm[followers], numbers.rotor_force_max[followers]
+        parameters, followers = plant_parameters(config.plant, config.attitude), list(config.plant.followers)
+        self._rotors = parameters.arm[followers], parameters.rotor_force_max[followers]
 
-    def _weighing(self, carried: Array, privileged: PrivilegedInfo) -> Array:
+    def _lifted_mass(self, carried: Array, privileged: PrivilegedInfo) -> Array:
         return self._model.of_flight(privileged.total_mass)
 
     def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
@@ -244,7 +245,7 @@ class KnownRigLqg(KnownFailuresLqg):
 
 
 class SlowKnownRigLqg(KnownRigLqg):
-    """The same with the tuning of `lqg-slow`."""
+    """`lqg-known-rig` with the tuning of `lqg-slow`."""
 
     name = "lqg-slow-known-rig"
     tuning = SLOW

@@ -1,7 +1,7 @@
-"""The linear motion of an assembly with ideal loops, what a law chooses of it, and its filter and position loop.
+"""Linear model of an assembly with ideal attitude loops, and the Kalman filter and position gains made from it.
 
-One motion serves pairs and teams: errors of O and their rates, both tilts with the torque of the rotors and of the
-load, and the lift. A law filters the states that it names. Body axes, or any that are turned about z.
+One model serves pairs and teams: errors of O and their rates, both tilts with the torques of rotors and load, and the
+lift. A controller filters the states that it names. Body axes, or axes turned about z.
 """
 
 from __future__ import annotations
@@ -16,51 +16,51 @@ from mjxball.baselines.assembly_model import AssemblyModel
 from mjxball.baselines.linear import Filter, continuous_regulator, discretise, kalman
 from mjxball.control.observation import OBSERVATION_SIZE
 
-# Places in the state. Along x: error [m], its rate [m/s], pitch [rad], its rate [rad/s], torque of the rotors [N m], of
-# the load [N m], and its rate [N m/s]; along y the same about roll.
+# Indices in the state. Along x: error [m], its rate [m/s], pitch [rad], its rate [rad/s], torque of the rotors [N m],
+# of the load [N m], and its rate [N m/s]; along y the same about roll.
 EX, VX, PITCH, PITCH_RATE, TORQUE, LOAD, LOAD_RATE = range(7)
 EY, VY, ROLL, ROLL_RATE, ROLLING = range(7, 12)
-# Error of the height [m], its rate [m/s], lift and error of the lift [m/s2]: what nobody commanded.
+# Error of the height [m], its rate [m/s], lift, and error of the lift [m/s2], which was not commanded.
 EZ, VZ, LIFT, LIFT_ERROR = range(12, 16)
 ROLL_LOAD, ROLL_LOAD_RATE = range(16, 18)  # as LOAD and LOAD_RATE, about roll
 STATES = 18
-AXES = (  # of roll and pitch, in the order of the first seven
+AXES = (  # of roll and pitch, in the order of the first seven states
     (EY, VY, ROLL, ROLL_RATE, ROLLING, ROLL_LOAD, ROLL_LOAD_RATE),
     (EX, VX, PITCH, PITCH_RATE, TORQUE, LOAD, LOAD_RATE),
 )
 HEIGHT = VZ, LIFT, LIFT_ERROR
-# Place in an observation.
+# Index in an observation.
 SHOWN = {EX: 12, VX: 15, PITCH: 4, PITCH_RATE: 10, EY: 13, VY: 16, ROLL: 3, ROLL_RATE: 9, EZ: 14, VZ: 17}
-TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
-PAIR_INERTIA = 0.0644  # of the pair about pitch, for which torque walks are [kg m2]
+TILT, VERTICAL = 0.15, 1.0  # values with a cost of 1 [rad], [m/s2]
+PAIR_INERTIA = 0.0644  # of the pair about pitch, to which values of torque_walk refer [kg m2]
 
 
 def noise(error: float = 3e-3, velocity: float = 2e-2, angle: float = 2e-3, rate: float = 2e-2) -> dict[int, float]:
-    """Deviation of what is measured, by its place in the state [m], [m/s], [rad], [rad/s]."""
+    """Standard deviations of the measurements by index of the state: [m], [m/s], [rad], [rad/s]."""
     along, across = (dict(zip(axis, (error, velocity, angle, rate), strict=False)) for axis in reversed(AXES))
     return along | across | {EZ: error, VZ: velocity}
 
 
 class Tuning(NamedTuple):
-    """What a law chooses: costs, intensities of the white noise that drives a state, memories, limits."""
+    """Parameters of a controller: costs, process noise of the states, time constants, limits."""
 
-    position: float  # that costs 1 [m]
-    velocity: float  # that costs 1 [m/s]
-    height: float  # that costs 1 [m]
-    climb: float  # that costs 1 [m/s]
-    torque_walk: float  # of the rate of the load's torque [(N m/s)2/s]
+    position: float  # error with a cost of 1 [m]
+    velocity: float  # with a cost of 1 [m/s]
+    height: float  # error with a cost of 1 [m]
+    climb: float  # with a cost of 1 [m/s]
+    torque_walk: float  # noise intensity of the rate of the load's torque [(N m/s)2/s]
     lift_walk: float = 0.0  # of the error of the lift [(m/s2)2/s]
     acceleration_walk: float = 0.0  # of every velocity [(m/s)2/s]
     turn_walk: float = 0.0  # of roll and pitch rate [(rad/s)2/s]
-    load_time: float = math.inf  # in which the filter forgets the load's torque [s]
-    rate_time: float = math.inf  # and the rate of it [s]
+    load_time: float = math.inf  # time constant with which the filter forgets the load's torque [s]
+    rate_time: float = math.inf  # and its rate [s]
     lift_time: float = math.inf  # and the error of the lift [s]
-    forecast_time: float = math.inf  # in which the rate of the load's torque dies out in a plan [s]
-    tilt_limit: float = 0.3  # of what position and velocity ask for [rad]
+    forecast_time: float = math.inf  # decay time of the rate of the load's torque in a plan [s]
+    tilt_limit: float = 0.3  # of the tilt that position and velocity ask for [rad]
     lift_limit: float = 2.0  # likewise [m/s2]
 
     def walks(self, scale: tuple[float, float] = (1.0, 1.0)) -> dict[int, float]:
-        """Intensities by place, those of the load's roll and pitch torque times the squares of `scale`."""
+        """Noise intensities by index of the state; those of the load's torques times the squares of `scale`."""
         found = {LIFT_ERROR: self.lift_walk}
         for axis, (_, velocity, _, rate, _, _, growth) in enumerate(AXES):
             found[growth] = self.torque_walk * scale[axis] ** 2
@@ -69,9 +69,9 @@ class Tuning(NamedTuple):
 
 
 def motion(model: AssemblyModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """(a (18, 18), b (18, 3)) of x' = a x + b u, for u what all drones' commands together ask for.
+    """(a (18, 18), b (18, 3)) of x' = a x + b u; u is the sum of what all drones' commands ask for.
 
-    That is roll and pitch torque [N m] and the mean vertical acceleration [m/s2]. Attitude loops and rotors are in a.
+    u is roll and pitch torque [N m] and the mean vertical acceleration [m/s2]. a includes attitude loops and rotors.
     """
     a, b = np.zeros((STATES, STATES)), np.zeros((STATES, 3))
     for axis, (error, velocity, angle, rate, torque, load, growth) in enumerate(AXES):
@@ -94,10 +94,10 @@ def disturbance_filter(
     deviations: Mapping[int, float],
     scale: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[Filter, np.ndarray]:
-    """(the filter of tilts with what turns them and, if its error walks, of the lift; (k, 18) its y of an observation).
+    """(filter of the tilts and their torques, and of the lift if its error walks; (k, 18) its y from an observation).
 
-    Its state: for each of `axes` angle, rate, torque of the rotors, of the load, its rate; then climb downwards, lift,
-    error of the lift. Its u as of `motion`; `deviations` as of `noise`, `scale` as of `Tuning.walks`.
+    States: for each of `axes` angle, rate, torque of the rotors, of the load, its rate; then climb downwards, lift,
+    error of the lift. Its u is that of `motion`; `deviations` as from `noise`, `scale` as for `Tuning.walks`.
     """
     states = [state for axis in axes for state in AXES[axis][2:]] + list(HEIGHT) * (tuning.lift_walk > 0.0)
     walks, measured = (
@@ -112,9 +112,9 @@ def disturbance_filter(
 
 
 def position_gains(model: AssemblyModel, tuning: Tuning) -> np.ndarray:
-    """(2, 3, 18) roll, pitch and vertical acceleration for an observation: for errors and their rates, against tilts.
+    """Gains (2, 3, 18) of roll, pitch and vertical acceleration on an observation: for errors and rates, and for tilts.
 
-    By LQRs of both tilts about their closed loops, and of the height.
+    From LQRs of both tilts about their closed loops, and of the height.
     """
     tilt_cost = np.diag([tuning.position**-2, tuning.velocity**-2, 0.0, 0.0])
     height_cost = np.diag([tuning.height**-2, tuning.climb**-2])

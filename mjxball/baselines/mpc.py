@@ -1,26 +1,26 @@
-"""Offset-free model-predictive control of pairs and teams: the limits of rotors and commands foreseen (ours).
+"""Offset-free model-predictive control of pairs and teams within the limits of rotors and commands (ours).
 
-A steady-state Kalman filter on all that the follower measures estimates the motion, the load's torque and the error of
-the lift, of which `lqg-offset-free` filters the last two alone. The law is the LQR of that motion about the target that
-the estimates ask for, with corrections v of all drones' mean command over the next second. As the cost of an LQR is
-x'Px plus the sum of v'Wv, W = R + B'PB, whatever v is, the best corrections are the solution of
+A steady-state Kalman filter on all measurements estimates the motion, the load's torque and the error of the lift;
+`lqg-offset-free` filters only the last two. The controller is the LQR of that motion about the target of these
+estimates, plus corrections v of all drones' mean command over the next second. The cost of an LQR is x'Px plus the sum
+of v'Wv, W = R + B'PB, for any v. The best corrections therefore solve
 
-    least sum of v' W v   so that the follower's commands and rotors, tilt and lift stay within their limits,
+    minimise the sum of v' W v   such that the follower's commands, rotors, tilt and lift keep their limits,
 
-a quadratic program with the exact infinite horizon behind its last step. Where the LQR itself keeps the limits, that is
-v = 0; OSQP (Stellato et al. 2020) solves it for the other flights of a batch alone. To go beyond a limit is not
-forbidden but dear, so that there always is a solution.
+a quadratic program that includes the infinite horizon after its last step exactly. Where the LQR itself keeps the
+limits, v = 0; OSQP (Stellato et al. 2020) solves the program only for the other flights of a batch. Limits are soft
+with a high cost, so that there always is a solution.
 
-Every follower of a team runs it for itself, in body axes, on what it measures, and takes the others to command as it
-does. The motion shows only the sum of what they estimate, so that each forgets the torque and the error of the lift in
-10 s: a constant load leaves a small error, of 1 % of what `copy` leaves.
+Every follower of a team runs it separately, in body axes, on its own measurements, and assumes that the others send the
+same command. Only the sum of their estimates shows in the motion. Each therefore forgets the torque and the error of
+the lift with a time constant of 10 s: a constant load leaves a small error, 1 % of that of `copy`.
 
-Measurements are taken to be one control step late, between none and the two that flights with delay have. The tuning of
-the pair is the best of about 40 sets of `benchmarks/observer_tuning.py mpc`, few, so that a longer search may find
-better, on flights with and without noise and delay, of known and of unknown mass. Its tilt limit, 0.136 rad, missed the
-RMSE of `benchmarks/cells.py` under noise; 0.18 rad was then chosen on the flights of the search, where it settles and
-overshoots about as well. That of teams is the best of 24 sets of `benchmarks/observer_tuning.py mpc-team`, which began
-at the best of about 25 by hand on such flights, the memory of 10 s among them: fewer still.
+Measurements are assumed to be one control step late, between zero and the two steps of flights with delay. The tuning
+of the pair is the best of about 40 sets of `benchmarks/observer_tuning.py mpc` on flights with and without noise and
+delay, of known and of unknown mass; a longer search may find better. Its tilt limit, 0.136 rad, missed the RMSE of
+`benchmarks/cells.py` under noise; 0.18 rad was then chosen on the flights of the search, where it settles and
+overshoots about as well. The tuning of teams is the best of 24 sets of `benchmarks/observer_tuning.py mpc-team`, which
+started from the best of about 25 by hand on such flights, with the time constant of 10 s among them.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ from mjxball.control.observation import ERROR, ERROR_RATE, mount_angles
 from mjxball.errors import InputError
 
 BLOCKS = (1, 1, 1, 2, 2, 3, 4, 6, 8, 10, 12)  # control steps for which a correction is held: 1 s
-CHECKED = (*range(8), 9, 11, 13, 16, 19, 23, 28, 34, 42)  # control steps at which the limits are kept
-MASSES = tuple(0.1 * number for number in range(11))  # of objects [kg]; the law is designed for the nearest
-BEYOND = 100.0  # cost of going beyond a limit, against that of the correction which avoids it
-# OSQP's own: step size, most iterations and tolerance in units of the square root of the cost (1e-4 rad).
+CHECKED = (*range(8), 9, 11, 13, 16, 19, 23, 28, 34, 42)  # control steps at which limits are enforced
+MASSES = tuple(0.1 * number for number in range(11))  # of objects [kg]; the design for the nearest is used
+BEYOND = 100.0  # cost of exceeding a limit, over that of the correction which avoids it
+# OSQP: step size, largest number of iterations, tolerance in units of the square root of the cost (1e-4 rad).
 RHO, ITERATIONS, TOLERANCE = 3.0, 400, 1e-3
 AXES = ((0, ROLL, ROLL_RATE), (1, PITCH, PITCH_RATE))
 
 
 class Program:
-    """The quadratic program for an object of `mass` [kg], in corrections over the square root of their cost."""
+    """The quadratic program for an object of `mass` [kg], in corrections times the square root of their cost."""
 
     def __init__(self, own: Design, limits: Limits, mass: float):
         from scipy import sparse
@@ -85,16 +85,16 @@ class Program:
         self.solved = self.failed = 0
 
     def broken(self, x: np.ndarray, hover: np.ndarray) -> np.ndarray:
-        """(n,) whether the LQR from states `x` (n, k) breaks a limit; a rotor at hover gives `hover` (n,) [N]."""
+        """(n,) whether the LQR exceeds a limit from states `x` (n, k); `hover` (n,) is a rotor's force at hover [N]."""
         rows = x @ self._states.T + hover[:, None] * self._lifting
         return ((rows < self._low) | (rows > self._high)).any(axis=-1)
 
     def corrections(self, x: np.ndarray, hover: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(first corrections (n, 3), whether they were found (n,)) from states `x` (n, k)."""
+        """(first corrections (n, 3), whether each was found (n,)) from states `x` (n, k)."""
         first, known = np.zeros((len(x), 3)), np.ones(len(x), bool)
         for number in np.nonzero(self.broken(x, hover))[0]:
             taken = self._states @ x[number] + hover[number] * self._lifting
-            with self._lock:  # the solver is one, and each program starts from no correction
+            with self._lock:  # one solver for all threads; each program starts from zero corrections
                 self._solver.update(l=self._low - taken, u=self._high - taken)
                 self._solver.warm_start(*self._none)
                 answer = self._solver.solve(raise_error=False)
@@ -105,12 +105,12 @@ class Program:
 
 
 def limit_rows(own: Design, limits: Limits, carried: float) -> tuple[np.ndarray, ...]:
-    """(rows of the state (m, n), of the corrections (m, k), low (m,), high (m,), of the hover force (m,)).
+    """Rows of the state (m, n), of the corrections (m, k), bounds low and high (m,), and rows of the hover force (m,).
 
-    In this order at every step that is checked: the command (3), rotor forces (4), roll, pitch and lift (3).
+    In this order at every step in `CHECKED`: command (3), rotor forces (4), roll, pitch and lift (3).
     """
     size, count, held = own.drive.shape[0], 3 * len(BLOCKS), np.repeat(np.arange(len(BLOCKS)), BLOCKS)
-    loop, enters = own.forecast + own.drive @ own.feedback, own.drive @ own.correction
+    loop, drive = own.forecast + own.drive @ own.feedback, own.drive @ own.correction
     asked, angles = np.diag([*limits.kp, carried])[[2, 0, 1]], np.zeros((3, size))  # lift, roll, pitch torque
     for axis, angle, rate in AXES:
         angles[1 + axis, [angle, rate]] = -limits.kp[axis], -limits.kd[axis]
@@ -122,7 +122,7 @@ def limit_rows(own: Design, limits: Limits, carried: float) -> tuple[np.ndarray,
         if step in CHECKED:
             rotors = limits.rotors @ (asked @ command + angles @ moved)
             found.append(np.vstack([command, rotors, moved[[ROLL, PITCH, LIFT]]]))
-        moved = loop @ moved + enters @ chosen
+        moved = loop @ moved + drive @ chosen
     rows, steps = np.vstack(found), len(CHECKED)
     high = np.concatenate([limits.command, np.full(4, limits.rotor_force), own.far_limit])
     low = np.concatenate([-limits.command, np.zeros(4), -own.far_limit])
@@ -131,16 +131,16 @@ def limit_rows(own: Design, limits: Limits, carried: float) -> tuple[np.ndarray,
 
 
 class Mpc:
-    """The law as a follower; its state (..., n + 3 `delay`) is the filter's, and the newest commands.
+    """The controller as a follower; its state (..., n + 3 `delay`) is the filter's state and the newest commands.
 
     It reads the believed mass of the object. `solved` and `failed` count its programs; where one is not solved within
-    `ITERATIONS`, the LQR is clipped.
+    `ITERATIONS`, the LQR's command is clipped.
     """
 
     name = NAME
     needs_privileged = False
     tuning, team_tuning = PAIR, TEAM
-    delay = 1  # control steps by which measurements are taken to be late
+    delay = 1  # assumed delay of measurements in control steps
 
     def __init__(self, config: Config):
         _osqp()
@@ -156,17 +156,17 @@ class Mpc:
         self._states = self._stacked.drive.shape[-2]
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which solve by themselves."""
+        """A copy has solvers of its own."""
         return {**self.__dict__, "_programs": {}}
 
     @property
     def solved(self) -> int:
-        """Programs that were solved so far."""
+        """Number of programs solved so far."""
         return sum(program.solved for program in self._programs.values())
 
     @property
     def failed(self) -> int:
-        """Programs that were not."""
+        """Number of programs that were not solved."""
         return sum(program.failed for program in self._programs.values())
 
     def start(self, observation: Array) -> Array:
@@ -192,22 +192,22 @@ class Mpc:
         return xp.concat([moved, commands[..., 3:]], axis=-1), self._sent(command)
 
     def _estimate(self, own: Design, state: Array, observation: Array) -> Array:
-        """The filter's state (..., n) at `observation`, as old as its measurements are taken to be."""
+        """The filter's state (..., n) corrected by `observation`, at the time of its measurements."""
         left = joined(self._measured(observation)) - joined([state[..., place] for place in MEASURED])
         return state[..., : self._states] + times(own.gain, left)
 
     def _seen(self, observation: Array) -> Array:
-        """`observation` (..., 18), of a team in mount frames, in body axes."""
+        """`observation` (..., 18) in body axes; for teams it comes in mount frames."""
         return observation if self._angles is None else rotations.turned_about_z(observation, self._angles)
 
     def _sent(self, command: Array) -> Array:
-        """`command` (..., 3) in body axes as it is sent, of a team in mount frames."""
+        """`command` (..., 3) in body axes as it is sent; for teams in mount frames."""
         if self._angles is None:
             return command
         return clip_command(rotations.turned_about_z(command, -self._angles), *self._leader[-2:])
 
     def _measured(self, observation: Array) -> list[Array]:
-        """What is `MEASURED`; velocities are the mean of the object's and of what the follower's own are at O."""
+        """Measurements of `MEASURED`; velocities are means of the object's and of those at O from the follower's."""
         error, rate, own = observation[..., ERROR], observation[..., ERROR_RATE], observation[..., 6:9]
         (roll, pitch), (p, q, r) = ((observation[..., place] for place in places) for places in ((3, 4), (9, 10, 11)))
         ahead, left = observation.__array_namespace__().asarray(self._mounts.T, dtype=observation.dtype)
@@ -217,7 +217,7 @@ class Mpc:
         return [error[..., 0], x, pitch, q, error[..., 1], y, roll, p, error[..., 2], z]
 
     def _moved(self, own: Design, x: Array, command: Array, hover: Array) -> Array:
-        """State (..., n) a period after `x` with the follower's `command` (..., 3), of rotors that have limits."""
+        """State (..., n) one period after `x` with the follower's `command` (..., 3) and saturating rotors."""
         led, lost = times(own.led, x), 0.0
         for drones, sent in ((1.0, led), (self._others, command)):
             room, asked = self._room(sent[..., 2], hover)[..., None], self._asked(sent, x)
@@ -225,33 +225,33 @@ class Mpc:
         return times(own.transition, x) + times(own.drive, command) + times(own.torque_drive, lost)
 
     def _asked(self, sent: Array, x: Array) -> Array:
-        """(..., 2) roll and pitch torque that the attitude loop of a drone asks for at `sent` (..., 3) [N m]."""
+        """Roll and pitch torque (..., 2) [N m] that a drone's attitude loop asks for at the command `sent` (..., 3)."""
         kp, kd = self._limits.kp.tolist(), self._limits.kd.tolist()
         return joined([kp[k] * (sent[..., k] - x[..., angle]) - kd[k] * x[..., rate] for k, angle, rate in AXES])
 
     def _room(self, vertical: Array, hover: Array) -> Array:
-        """Largest torque (...) [N m] that a drone's rotors give while they lift."""
+        """Largest torque (...) [N m] of a drone's rotors while they lift with `vertical` (...) [m/s2]."""
         lift = hover * (1.0 + vertical / self._gravity)
         left = lift.__array_namespace__().minimum(lift, self._limits.rotor_force - lift)
         return self._limits.torque_per_force * clipped(left, 0.0, self._limits.rotor_force)
 
     def _command(self, own: Design, x: Array, hover: Array, kind: Array) -> Array:
-        """The command (..., 3) at state `x` (..., n), its vertical part clipped first: it takes what rotors have."""
+        """Command (..., 3) at state `x` (..., n). The vertical part is clipped first, because it uses rotor force."""
         xp, (tilt_limit, vertical_limit) = x.__array_namespace__(), self._leader[-2:]
-        wanted, far = times(own.feedback, x), times(own.far, x)
+        desired, far = times(own.feedback, x), times(own.far, x)
         correction, known = self._corrections(x, hover, kind)
         limited = clipped(far, -own.far_limit, own.far_limit) - far
-        wanted = wanted + times(own.correction, xp.where(known[..., None], correction, limited))
-        vertical = clipped(wanted[..., 2], -vertical_limit, vertical_limit)
+        desired = desired + times(own.correction, xp.where(known[..., None], correction, limited))
+        vertical = clipped(desired[..., 2], -vertical_limit, vertical_limit)
         room, parts = self._room(vertical, hover), []
         for axis, angle, rate in AXES:
             kp, kd = float(self._limits.kp[axis]), float(self._limits.kd[axis])
             rest = x[..., angle] + kd / kp * x[..., rate]
-            parts.append(clipped(wanted[..., axis], rest - room / kp, rest + room / kp))
+            parts.append(clipped(desired[..., axis], rest - room / kp, rest + room / kp))
         return clip_command(joined([*parts, vertical]), tilt_limit, vertical_limit)
 
     def _corrections(self, x: Array, hover: Array, kind: Array) -> tuple[Array, Array]:
-        """(first corrections (..., 3), whether they were found (...)); in a JAX program by a call back to NumPy."""
+        """(first corrections (..., 3), whether each was found (...)); in JAX by a callback to NumPy."""
         if isinstance(x, np.ndarray):
             return self._solve(x, hover, kind)
         return _from_jax(self._solve)(x, hover, kind)
@@ -270,16 +270,16 @@ class Mpc:
 
 
 def _from_jax(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """`solve` for arrays of a JAX program; it has no derivative."""
+    """`solve` as a JAX function, without a derivative."""
     import jax
 
     @jax.custom_jvp
     def call(x: Array, hover: Array, kind: Array) -> Any:
-        single = np.dtype(np.float32)  # the thread of a call back knows of nothing wider
+        single = np.dtype(np.float32)  # 64-bit types are not enabled in a callback's thread
         shapes = jax.ShapeDtypeStruct((*x.shape[:-1], 3), single), jax.ShapeDtypeStruct(x.shape[:-1], bool)
 
-        def answer(*given: Any) -> tuple[np.ndarray, np.ndarray]:
-            first, known = solve(*given)
+        def answer(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+            first, known = solve(*arguments)
             return first.astype(single), known
 
         first, known = jax.pure_callback(answer, shapes, x, hover, kind, vmap_method="broadcast_all")

@@ -1,6 +1,6 @@
-"""What model-predictive control is built from: the assembly's motion, its filter and its LQR, as matrices (ours).
+"""Matrices of model-predictive control: the assembly's motion, its filter and its LQR (ours).
 
-Body axes. All N - 1 followers are taken to send the command of the one that plans.
+Body axes. All N - 1 followers are assumed to send the same command.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 NAME = "mpc"
-PAIR_STATES = STATES - 2  # no load about roll
+PAIR_STATES = STATES - 2  # without a load about roll
 MEASURED = noise(velocity=1.4e-2, angle=5e-3)
-MEMORY = 10.0  # in which one of several followers forgets the load's torque and the error of the lift [s]
-ALIKE = 1e-6  # by which drones of a team may differ
-SPARE = 0.04  # share of a rotor's largest force that is left to yaw and to what is not linear
+MEMORY = 10.0  # time constant with which a team's follower forgets load torque and lift error [s]
+ALIKE = 1e-6  # largest difference of a team's drones
+SPARE = 0.04  # share of a rotor's largest force reserved for yaw and nonlinearities
 
 
 PAIR = Tuning(
@@ -78,53 +78,53 @@ TEAM = Tuning(
 
 
 class Design(NamedTuple):
-    """The law for an object of one mass: x <- A x + B u of the followers' command u, the leader's law in A."""
+    """The controller for one mass of the object: x <- A x + B u of the followers' command u, with the leader in A."""
 
     transition: Float[Array, "n n"]  # A of the filter; n = 16, of a team 18
     forecast: Float[Array, "n n"]  # A of the plan
     drive: Float[Array, "n 3"]  # B
-    torque_drive: Float[Array, "n 2"]  # of a roll and a pitch torque of the rotors [N m]
-    gain: Float[Array, "n 10"]  # of the filter, on what is `MEASURED`
+    torque_drive: Float[Array, "n 2"]  # of additional roll and pitch torques of the rotors [N m]
+    gain: Float[Array, "n 10"]  # of the filter, on the measurements `MEASURED`
     feedback: Float[Array, "3 n"]  # F of u = F x + E v
     correction: Float[Array, "3 3"]  # E, on a correction v of the mean of all drones' commands
     cost: Float[Array, " 3"]  # of the square of v
     led: Float[Array, "3 n"]  # the leader's command
-    far: Float[Array, "3 n"]  # part of the mean command that errors and their rates ask for
-    far_limit: Float[Array, " 3"]  # roll and pitch [rad] and lift [m/s2] of the assembly, at most
+    far: Float[Array, "3 n"]  # part of the mean command for errors and their rates
+    far_limit: Float[Array, " 3"]  # limits of the assembly's roll and pitch [rad] and lift [m/s2]
 
 
 class Limits(NamedTuple):
-    """What commands and rotors of a follower may be, and what its attitude loop makes of a command."""
+    """Limits of a follower's commands and rotors, and its attitude loop."""
 
     command: Float[np.ndarray, " 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
-    rotor_force: float  # largest, less what is spared [N]
+    rotor_force: float  # largest, without the reserve `SPARE` [N]
     rotors: Float[np.ndarray, "4 3"]  # rotor forces per lift [N], roll and pitch torque [N m]
     kp: Float[np.ndarray, " 2"]  # about roll and pitch [N m/rad]
     kd: Float[np.ndarray, " 2"]  # [N m s/rad]
-    own_mass: float  # that it lifts besides its share of the object [kg]
+    own_mass: float  # mass that it lifts besides its share of the object [kg]
     load_share: float
     torque_per_force: float  # [m]
 
 
 def known_model(config: Config) -> AssemblyModel:
-    """The assembly; InputError unless `config` is a free pair along x, or a free team of drones that are alike."""
+    """Model of the assembly; InputError unless `config` is a free pair along x or a free team of equal drones."""
     if not config.plant.is_team:
         return pair_model(config, NAME)
-    model, numbers = ideal_model(config, NAME), plant_parameters(config.plant, config.attitude)
-    own = numbers.known_mass, numbers.load_share, numbers.arm, numbers.rotor_force_max, numbers.rotor_lag, numbers.yaw
+    model, params = ideal_model(config, NAME), plant_parameters(config.plant, config.attitude)
+    own = params.known_mass, params.load_share, params.arm, params.rotor_force_max, params.rotor_lag, params.yaw
     if max(float(np.ptp(part)) for part in own) > ALIKE:
         raise InputError(f"follower {NAME!r} flies teams of drones that are alike, with one plan for all; these differ")
     return model
 
 
 def design(config: Config, tuning: Tuning, mass: float) -> Design:
-    """The law for the plant of `config` with an object of `mass` [kg]; InputError as of `known_model`."""
+    """The controller for the plant of `config` with an object of `mass` [kg]; InputError as from `known_model`."""
     nominal = known_model(config)
     model, levers = _with_object(config, nominal, mass), _levers(nominal, mass)
     roll, pitch = nominal.inertia
     team = config.plant.is_team
     scale, size = ((roll / PAIR_INERTIA, pitch / PAIR_INERTIA), STATES) if team else ((0.0, 1.0), PAIR_STATES)
-    # The motion shows the sum alone of what followers estimate: what each kept for good would drift apart.
+    # Only the sum of the followers' estimates shows in the motion: without forgetting they would drift apart.
     memory = MEMORY if model.followers > 1 else math.inf
     filtering = motion(model, tuning._replace(load_time=memory, lift_time=memory))
     planning = motion(model, tuning._replace(rate_time=tuning.forecast_time))
@@ -161,9 +161,9 @@ def _with_object(config: Config, model: AssemblyModel, mass: float) -> AssemblyM
 
 
 def _asked(model: AssemblyModel, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(3, 3) each: what the leader's command, and all followers', ask for, as the u of `motion`; `levers` of `_levers`.
+    """Matrices (3, 3) from the leader's command and from all followers' to u of `motion`; `levers` from `_levers`.
 
-    An uneven lift turns as well.
+    Unequal lift gives a torque, too.
     """
     count, found = len(model.own_mass), []
     for drones, lever in zip((1, count - 1), levers, strict=True):
@@ -174,16 +174,16 @@ def _asked(model: AssemblyModel, levers: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _levers(model: AssemblyModel, mass: float) -> np.ndarray:
-    """(2, 2) roll and pitch torque that the leader, that all followers make by lifting 1 m/s2 more [N m s2/m]."""
+    """(2, 2) roll and pitch torque per 1 m/s2 more lift of the leader, and of all followers [N m s2/m]."""
     each = model.lever_torque(np.diag(model.carried(np.array(mass))))
     return np.stack([each[model.leader], each.sum(axis=0) - each[model.leader]])
 
 
 def _about_target(model: AssemblyModel, mean: np.ndarray, forgets: float) -> np.ndarray:
-    """`mean` (3, 18) about the target: the rotors' torque less what holds the load's, the lift less its error.
+    """`mean` (3, 18) about the target: rotor torque minus what holds the load's torque, lift minus its error.
 
-    Both as the filter expects them to be once rotors have followed. Else the lag would make more of an estimate than
-    the filter forgets, and the followers' estimates drift apart.
+    Both are taken as the filter predicts them once the rotors have followed. Otherwise the lag would amplify an
+    estimate more than the filter forgets, and the followers' estimates would drift apart.
     """
     mean, ahead = mean.copy(), model.lag + 0.5 * model.period
     for axis, (*_, torque, load, rate) in enumerate(AXES):
@@ -197,10 +197,10 @@ def _about_target(model: AssemblyModel, mean: np.ndarray, forgets: float) -> np.
 def _followers_command(
     model: AssemblyModel, mean: np.ndarray, led: np.ndarray, levers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(F (3, 18), E (3, 3)) of `Design`: all followers' command for a `mean` (3, 18) with the leader's `led`."""
+    """(F (3, 18), E (3, 3)) of `Design`: the followers' command for the gains `mean` and the leader's `led`."""
     count, others = len(model.own_mass), model.followers
     feedback, correction = (count * mean - led) / others, count / others * np.eye(3)
-    for axis in (0, 1):  # less what uneven lifts turn
+    for axis in (0, 1):  # minus the torque of unequal lifts
         of_leader, of_followers = levers[:, axis] / others / model.kp[axis]
         feedback[axis] -= of_leader * led[2] + of_followers * feedback[2]
         correction[axis] -= of_followers * correction[2]
@@ -208,7 +208,7 @@ def _followers_command(
 
 
 def _leaders_command(config: Config) -> np.ndarray:
-    """(3, 18) what the leader's PD law commands."""
+    """(3, 18) gains of the leader's PD controller on the state."""
     led, g = np.zeros((3, STATES)), config.plant.gravity
     kp, kd = (np.broadcast_to(gain, 3) for gain in (config.leader.kp, config.leader.kd))
     led[0, [EY, VY]], led[1, [EX, VX]] = np.array([-kp[1], -kd[1]]) / g, np.array([kp[0], kd[0]]) / g
@@ -217,32 +217,32 @@ def _leaders_command(config: Config) -> np.ndarray:
 
 
 def _regulators(open_loop: np.ndarray, drive: np.ndarray, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """(mean commands (3, 18) of the LQRs of roll, pitch and height, what a correction of each costs (3,)).
+    """(gains (3, 18) of the mean command by LQRs of roll, pitch and height, cost (3,) of a correction of each).
 
-    `drive` (18, 3) of the mean of all drones' commands.
+    `drive` (18, 3) is that of the mean of all drones' commands.
     """
     mean, cost = np.zeros((3, STATES)), np.zeros(3)
     tilt, height = (tuning.position, tuning.velocity), (tuning.height, tuning.climb)
     axes = [(axis[:5], tilt, TILT) for axis in AXES]
-    for row, (states, weights, most) in enumerate([*axes, ((EZ, VZ, LIFT), height, VERTICAL)]):
+    for row, (states, weights, scale) in enumerate([*axes, ((EZ, VZ, LIFT), height, VERTICAL)]):
         q = np.zeros(len(states))
         q[:2] = np.array(weights) ** -2.0
         gains, price = regulator(
-            open_loop[np.ix_(states, states)], drive[states, row][:, None], np.diag(q), np.array([[most**-2]])
+            open_loop[np.ix_(states, states)], drive[states, row][:, None], np.diag(q), np.array([[scale**-2]])
         )
         mean[row, states], cost[row] = -gains[0], price.item()
     return mean, cost
 
 
 def limits_of(config: Config) -> Limits:
-    """Of each follower of `config`."""
-    model, numbers, command = known_model(config), plant_parameters(config.plant, config.attitude), config.command
+    """Limits of each follower of `config`."""
+    model, params, command = known_model(config), plant_parameters(config.plant, config.attitude), config.command
     one, layout = config.plant.followers[0], config.plant.layout
-    arm, unit = float(numbers.arm[one]), mixer.turned(np.eye(4)[:3], -numbers.yaw[one])
+    arm, unit = float(params.arm[one]), mixer.turned(np.eye(4)[:3], -params.yaw[one])
     return Limits(
         command=np.array([command.tilt_limit, command.tilt_limit, command.vertical_limit]),
-        rotor_force=(1.0 - SPARE) * float(numbers.rotor_force_max[one]),
-        rotors=mixer.rotors_from_wrench(unit, arm, float(numbers.yaw_per_thrust[one]), layout).T,
+        rotor_force=(1.0 - SPARE) * float(params.rotor_force_max[one]),
+        rotors=mixer.rotors_from_wrench(unit, arm, float(params.yaw_per_thrust[one]), layout).T,
         kp=np.array(model.kp),
         kd=np.array(model.kd),
         own_mass=float(model.known_mass[one]),

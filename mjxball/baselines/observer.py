@@ -1,7 +1,7 @@
-"""A PD law and a disturbance observer: what a control engineer would try first on the paper's pair (ours).
+"""A PD controller with a disturbance observer, a standard design for the paper's pair (ours).
 
 Its gains were found by a random search on the flights of `benchmarks/observer_tuning.py`, with and without noise and
-delay; the script goes on from them.
+delay; the script continues from them.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 
 
 class ObserverGains(NamedTuple):
-    """PD law of the position, and how quickly the observers follow, each (...)."""
+    """Gains of the PD controller of the position, and bandwidths of the observers, each (...)."""
 
     position: Array = 0.737  # [rad/m]
     velocity: Array = 0.575  # [rad s/m]
-    tilt_limit: Array = 0.124  # of the PD law [rad]
+    tilt_limit: Array = 0.124  # of the PD controller [rad]
     height: Array = 2.8  # vertical acceleration for an error [1/s2]
     climb: Array = 2.66  # and for a velocity [1/s]
     torque_bandwidth: Array = 15.8  # [rad/s]
@@ -29,17 +29,17 @@ class ObserverGains(NamedTuple):
 
 
 class ObserverState(NamedTuple):
-    """What both commands and the disturbance seen so far explain of the motion."""
+    """Motion explained by both commands and the disturbance estimated so far."""
 
     rate: Array  # (...) of pitch [rad/s]
     climb: Array  # (...) [m/s]
 
 
 class Observer:
-    """A PD law that brings the pair to the goal, less the torque and the lift that a disturbance observer sees.
+    """A PD controller of the pair's position that cancels the torque and lift estimated by a disturbance observer.
 
-    The observer (Ohnishi's, of first order) compares pitch rate and climb with the integral of what both drones command
-    and of what it has seen: d = w (rate - integral). The leader's command is known, for the law is.
+    The observer (Ohnishi's, of first order) compares pitch rate and climb with the integral of both drones' commands
+    and of its estimate: d = w (rate - integral). The leader's command is computed from its known controller.
     """
 
     name = "observer"
@@ -57,21 +57,21 @@ class Observer:
 
     def step(self, state: ObserverState, observation: Array, privileged: PrivilegedInfo) -> tuple[ObserverState, Array]:
         """See `Law.step`."""
-        own, led, limits = self.gains, copy_command(observation, *self._leader), self._leader[-2:]
+        gains, led, limits = self.gains, copy_command(observation, *self._leader), self._leader[-2:]
         error, velocity = observation[..., ERROR], observation[..., ERROR_RATE]
-        seen = own.torque_bandwidth * (observation[..., 10] - state.rate)  # [rad/s2]
-        lift = own.lift_bandwidth * (-velocity[..., 2] - state.climb)  # [m/s2]
-        reach = own.tilt_limit
+        turning = gains.torque_bandwidth * (observation[..., 10] - state.rate)  # disturbance [rad/s2]
+        lift = gains.lift_bandwidth * (-velocity[..., 2] - state.climb)  # disturbance [m/s2]
+        tilt_limit = gains.tilt_limit
         ahead, aside = (
-            clipped(own.position * error[..., axis] + own.velocity * velocity[..., axis], -reach, reach)
+            clipped(gains.position * error[..., axis] + gains.velocity * velocity[..., axis], -tilt_limit, tilt_limit)
             for axis in (0, 1)
         )
-        rise = own.height * error[..., 2] + own.climb * velocity[..., 2] - lift
-        pitch = 2.0 * ahead - led[..., 1] - self._inertia * seen / self._kp
+        rise = gains.height * error[..., 2] + gains.climb * velocity[..., 2] - lift
+        pitch = 2.0 * ahead - led[..., 1] - self._inertia * turning / self._kp
         command = leader.clip_command(joined([-2.0 * aside - led[..., 0], pitch, 2.0 * rise - led[..., 2]]), *limits)
         torque = self._kp * (led[..., 1] + command[..., 1] - 2.0 * observation[..., 4])
         turn = (torque - 2.0 * self._kd * observation[..., 10]) / self._inertia
         climb = 0.5 * (led[..., 2] + command[..., 2])
         return ObserverState(
-            state.rate + self._period * (turn + seen), state.climb + self._period * (climb + lift)
+            state.rate + self._period * (turn + turning), state.climb + self._period * (climb + lift)
         ), command

@@ -1,4 +1,4 @@
-"""Reference followers: `stay` and `random`, which anything must beat, and `oracle`, which knows the CG."""
+"""Reference followers: `stay` and `random` as lower bounds, and `oracle`, which knows the CG."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class Random:
 
 
 class Oracle:
-    """Feed-forward of the true CG (ours), for a CG along x of a pair:
+    """Feed-forward of the true CG (ours), for a pair with the CG along x:
 
-    theta_f = theta_l - (g + az) m_o c / Kp_theta + 2 m_o c'' / (M g), roll and az as the leader.
-    About roll the same of a CG along y, both terms with the other sign. Several followers share the CG's torque as
-    `AssemblyModel.corrections` says, and each gives N / F in place of 2.
+    theta_f = theta_l - (g + az) m_o c / Kp_theta + 2 m_o c'' / (M g), roll and az as the leader. For a CG along y the
+    same about roll, with the signs of both terms changed. Several followers share the CG's torque by
+    `AssemblyModel.corrections`, with N / F in place of 2.
     """
 
     name = "oracle"
@@ -91,7 +91,7 @@ class Oracle:
         return state, model.sent(clip_command(command, *self._limits))
 
     def _torques(self, moment: Array) -> Array:
-        """(..., 2) roll and pitch torque over gravity of the load's `moment`, as `PrivilegedInfo` has it."""
+        """Roll and pitch torque (..., 2) over gravity of the load's `moment`, in the form of `PrivilegedInfo`."""
         xp, model = moment.__array_namespace__(), self._model
         if model.angles is None:
             return model.on_axes(SIGNS[model.axes[0]] * moment[..., None])

@@ -12,13 +12,13 @@ from mjxball.evaluate.plots import distance, of_followers
 from mjxball.plotting import INK, follower_styles, legend_above, line, logarithmic, pyplot, rendered
 
 POINTS = 240  # of a curve over time
-LEAST_PEAK = 1e-4  # of the axis of peaks [m]
-NOT_DRAWN = ("stay", "random")  # they would flatten every scale
+LEAST_PEAK = 1e-4  # lower end of the axis of peaks [m]
+HIDDEN = ("stay", "random")  # their errors would dominate every scale
 
 
 def variant_curves(scores: Sequence[Score], axis: str) -> str:
-    """Steady-state peak and settling over the variants of one suite, every follower with its interval."""
-    plt, names = pyplot(), [name for name in dict.fromkeys(s.follower for s in scores) if name not in NOT_DRAWN]
+    """Steady-state peak and RMSE over the variants of one suite, with the interval of every follower, as SVG."""
+    plt, names = pyplot(), [name for name in dict.fromkeys(s.follower for s in scores) if name not in HIDDEN]
     variants = list(dict.fromkeys(score.variant for score in scores))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     looks = follower_styles(names)
@@ -43,8 +43,8 @@ def variant_curves(scores: Sequence[Score], axis: str) -> str:
 
 
 def flight_curves(scores: Sequence[Score]) -> str:
-    """One variant's flights of seed 0: x and distance from the goal of the object, and the follower's pitch command."""
-    plt, shown = pyplot(), [score for score in scores if score.follower not in NOT_DRAWN]
+    """Flights of one variant, seed 0, as SVG: the object's x and distance from the goal, pitch commands."""
+    plt, shown = pyplot(), [score for score in scores if score.follower not in HIDDEN]
     figure, axes = plt.subplots(3, 1, sharex=True, figsize=(10, 5.8), layout="constrained")
     looks, first = follower_styles(score.follower for score in scores), scores[0].first.flight
     rows = np.unique(np.linspace(0, len(first.time) - 1, POINTS).astype(int))
@@ -67,7 +67,7 @@ def flight_curves(scores: Sequence[Score]) -> str:
 
 
 def heat_maps(scores: Sequence[Score]) -> str:
-    """Steady-state peak over (CG speed, object mass), one map for each follower, all on one logarithmic scale."""
+    """Steady-state peak over CG speed and object mass as SVG, one map per follower, all on one logarithmic scale."""
     speeds = sorted({score.first.scenario.omega for score in scores})
     masses = sorted({score.first.scenario.mass for score in scores})
     peaks: dict[str, np.ndarray] = {}

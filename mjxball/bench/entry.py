@@ -1,4 +1,4 @@
-"""Entries of the benchmark: what a follower came to, in a file that the leaderboard reads."""
+"""Entries of the benchmark: results of one follower in a file that the leaderboard reads."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from mjxball.reading import parse_json
 
 CONDITIONS = ("undisturbed", "disturbed")
 HEADS = ["track", "", "met %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
-# Of an entry, beside the benchmark and its version.
+# Keys of an entry and their types, besides the benchmark and its version.
 KINDS = {
     **{"draw": int, "follower": str, "date": str, "command": str, "commit": str},
     **{"versions": dict, "tracks": dict, "not_flown": dict},
 }
-LARGEST = 1e9  # of any number
-SHARES = ("met", "low", "high", "failed")  # of one condition's numbers
-NUMBERS = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
+MAX_VALUE = 1e9  # bound on any value
+SHARES = ("met", "low", "high", "failed")  # required values of one condition
+VALUES = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
 
 
 def run(
     name: str, make: Make, tracks: Sequence[str], draw: int, progress: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
-    """The entry of a follower, without what `mjxball.commands` knows of the machine.
+    """The entry of a follower, without the keys on the machine that `mjxball.commands` adds.
 
-    A track whose plants it refuses is left out with its sentence. Raises InputError if that is so of all tracks.
+    A track whose plants the follower refuses is left out, with the reason. Raises InputError if it refuses all tracks.
     """
     if draw < 0:
         raise InputError(f"--draw must not be negative, but is {draw}")
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     refused: dict[str, str] = {}
     for track in tracks:
         try:
@@ -48,36 +48,36 @@ def run(
         except InputError as error:
             refused[track] = str(error)
             continue
-        found[track] = measure(track, draw, make, progress)
-    if not found:
+        results[track] = measure(track, draw, make, progress)
+    if not results:
         raise InputError(f"{name} flies no track: {next(iter(refused.values()))}")
     date = datetime.datetime.now(datetime.UTC).date().isoformat()
-    whole = {"benchmark": NAME, "version": VERSION, "draw": draw, "follower": name, "date": date}
-    return {**whole, "tracks": found, "not_flown": refused}
+    head = {"benchmark": NAME, "version": VERSION, "draw": draw, "follower": name, "date": date}
+    return {**head, "tracks": results, "not_flown": refused}
 
 
 def measure(track: str, draw: int, make: Make, progress: Callable[[str], None]) -> dict[str, dict[str, Any]]:
-    """What the follower comes to on `track`, of undisturbed flights and of disturbed ones.
+    """Results of the follower on `track`, by condition: undisturbed and disturbed.
 
-    Raises InputError if it does not fly the track's plants, or is none that can be flown (`mjxball.bench.followers`).
+    Raises InputError if it refuses the track's plants or fails the checks of `mjxball.bench.followers`.
     """
     flown: list[Metrics] = []
-    met: list[bool] = []
+    succeeded: list[bool] = []
     worlds = worlds_of(track, draw)
-    # All refusals before the first flight; with the first plant as many calls as a flight has.
-    whole = round(worlds[0].scenarios[0][0].seconds / worlds[0].config.timing.control_period)
-    entrants = [checked(make, world.config, *[] if number else [whole]) for number, world in enumerate(worlds)]
+    # Check all followers before the first flight; on the first plant with as many calls as a flight has.
+    steps = round(worlds[0].scenarios[0][0].seconds / worlds[0].config.timing.control_period)
+    entrants = [checked(make, world.config, *[] if number else [steps]) for number, world in enumerate(worlds)]
     for number, (world, follower) in enumerate(zip(worlds, entrants, strict=True)):
         progress(f"{track}: {number + 1}/{len(worlds)}")
         (mine,) = world.fly([follower], [one for pair in world.scenarios for one in pair])
-        flown, met = [*flown, *mine], [*met, *are_met(mine, bars(track, draw, number))]
-    return {name: summary(flown[row::2], met[row::2]) for row, name in enumerate(CONDITIONS)}
+        flown, succeeded = [*flown, *mine], [*succeeded, *are_met(mine, bars(track, draw, number))]
+    return {name: summary(flown[row::2], succeeded[row::2]) for row, name in enumerate(CONDITIONS)}
 
 
 def read_entry(path: Path) -> dict[str, Any]:
-    """An entry that the leaderboard can show: of this version, all published flights of a track, from a commit.
+    """An entry that the leaderboard can show: of this version, with all published flights of each track, from a commit.
 
-    InputError with one sentence for anything else.
+    Raises InputError with one sentence for anything else.
     """
     text = read_text(path, "entry")
     try:
@@ -94,11 +94,11 @@ def read_entry(path: Path) -> dict[str, Any]:
         raise InputError(f"entry {path} has no name of one word as follower, or no date as 2026-01-31")
     if not entry["tracks"] or set(entry["tracks"]) & set(entry["not_flown"]):
         raise InputError(f"entry {path} has no track, or one that was flown and not flown")
-    for track, found in entry["tracks"].items():
+    for track, results in entry["tracks"].items():
         for condition in CONDITIONS:
-            if track not in TRACKS or not isinstance(found, dict) or not _measured(found.get(condition)):
-                raise InputError(f"entry {path} has no numbers as this version has them of track {track}, {condition}")
-    flown = {found[condition]["flights"] for found in entry["tracks"].values() for condition in CONDITIONS}
+            if track not in TRACKS or not isinstance(results, dict) or not _measured(results.get(condition)):
+                raise InputError(f"entry {path} lacks valid results of track {track}, {condition}")
+    flown = {results[condition]["flights"] for results in entry["tracks"].values() for condition in CONDITIONS}
     if flown != {FLIGHTS} or entry["draw"] != 0:
         counts = ", ".join(map(str, sorted(flown)))
         raise InputError(f"entry {path} is of {counts} flights of draw {entry['draw']}; ranked are {FLIGHTS} of draw 0")
@@ -115,27 +115,27 @@ def _check_kinds(path: Path, entry: dict[str, Any]) -> None:
             raise InputError(f"entry {path} has {name} {entry[name]!r}, which is no {kind.__name__}")
 
 
-def _measured(numbers: Any) -> bool:
-    """Whether these are one condition's numbers, as `success.summary` has them."""
-    if not isinstance(numbers, dict) or set(numbers) != NUMBERS or type(numbers["flights"]) is not int:
+def _measured(values: Any) -> bool:
+    """Whether `values` are one condition's results, as `success.summary` returns them."""
+    if not isinstance(values, dict) or set(values) != VALUES or type(values["flights"]) is not int:
         return False
-    if not all(numbers[name] is None or type(numbers[name]) in (int, float) for name in NUMBERS):
+    if not all(values[name] is None or type(values[name]) in (int, float) for name in VALUES):
         return False
-    if any(numbers[name] is None for name in SHARES):
+    if any(values[name] is None for name in SHARES):
         return False
-    low, met, high, failed = (numbers[name] for name in ("low", "met", "high", "failed"))
-    limit = numbers["rotors_at_limit"] or 0
+    low, met, high, failed = (values[name] for name in ("low", "met", "high", "failed"))
+    limit = values["rotors_at_limit"] or 0
     return (
         0 <= low <= met <= high <= 1
         and failed >= 0
         and met + failed <= 1 + 1e-9
         and 0 <= limit <= 1
-        and all(0 <= (numbers[name] or 0) < LARGEST for name in NUMBERS)
+        and all(0 <= (values[name] or 0) < MAX_VALUE for name in VALUES)
     )
 
 
 def _is_date(text: str) -> bool:
-    """Whether it is a day, as 2026-01-31."""
+    """Whether `text` is a date such as 2026-01-31."""
     try:
         return datetime.date.fromisoformat(text).isoformat() == text
     except ValueError:
@@ -143,7 +143,7 @@ def _is_date(text: str) -> bool:
 
 
 def table(entry: dict[str, Any]) -> str:
-    """The entry as text, one line a track and condition."""
+    """The entry as a text table, one line per track and condition."""
     rows: list[Sequence[str]] = [HEADS]
     for track, found in entry["tracks"].items():
         rows += [(TRACKS[track].title, condition, *cells(found[condition])) for condition in CONDITIONS]
@@ -155,7 +155,7 @@ def table(entry: dict[str, Any]) -> str:
 
 
 def cells(found: dict[str, Any]) -> tuple[str, ...]:
-    """Numbers of one condition as text: met, its interval, failed, settling, peak, rotors at a limit, change."""
+    """Results of one condition as text: success, its interval, failures, settling, peak, rotors at a limit, change."""
 
     def shown(name: str, factor: float, digits: int) -> str:
         return "-" if found[name] is None else f"{factor * found[name]:.{digits}f}"

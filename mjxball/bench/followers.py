@@ -20,26 +20,26 @@ from mjxball.policy import Policy, policy_path, shipped_policies
 
 __all__ = ["Make", "checked", "entrant"]
 
-SLOWEST = 0.020  # [s] that a call for one flight may take, in the median of CALLS that follow each other
+MAX_CALL_TIME = 0.020  # largest median time of CALLS consecutive calls for one flight [s]
 CALLS = 20
 TYPES = {"observation": "tensor(float)", "memory": "tensor(float)", "start": "tensor(bool)"}  # of inputs
-UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # told what no follower can know, or no laws
+UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # with privileged information, or no controllers
 
 
 def entrant(text: str) -> tuple[str, Make]:
-    """(name, what makes it for a plant) of the follower that `text` says; InputError if there is none.
+    """(name, function that makes it for a plant) of the follower that `text` names; InputError if there is none.
 
-    `text`: POLICY.npz or a shipped one's name, MODEL.onnx, or what `evaluate.followers.find_follower` finds.
+    `text` is POLICY.npz or the name of a shipped one, MODEL.onnx, or what `evaluate.followers.find_follower` finds.
     """
     path = policy_path(text)
     if path.suffix == ".npz":
-        Policy.load(path)  # refused at once where it is none
+        Policy.load(path)  # raises at once for a bad file
         return path.stem, lambda config: _loaded(path, config)
     if path.suffix == ".onnx":
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
     if text in UNRANKED:
-        raise InputError(f"{text} is not ranked: it is told what no follower can know, or is no law")
+        raise InputError(f"{text} is not ranked: it uses information that no follower can have, or is no controller")
     if text not in LAWS and ":" not in text:
         names = [*(shipped.stem for shipped in shipped_policies()), *(name for name in LAWS if name not in UNRANKED)]
         raise InputError(
@@ -49,7 +49,7 @@ def entrant(text: str) -> tuple[str, Make]:
 
 
 def _loaded(path: Path, config: Config) -> Policy:
-    """The policy; why it does not fly is said without the place of its file, since an entry keeps that."""
+    """The policy; its errors are worded without the file's path, because entries store them."""
     try:
         return load_policy(path, config)
     except InputError as error:
@@ -57,7 +57,7 @@ def _loaded(path: Path, config: Config) -> Policy:
 
 
 class OnnxFollower:
-    """An ONNX model with the inputs and outputs of `mjxball.export`, one flight a row."""
+    """An ONNX model with the inputs and outputs of `mjxball.export`, one row per flight."""
 
     def __init__(self, name: str, session: Any):
         self.name, self._session = name, session
@@ -120,7 +120,7 @@ def _session(path: Path) -> Any:
 
 
 def checked(make: Make, config: Config, calls: int = CALLS) -> Follower:
-    """`make(config)`, after `calls` for a flight at rest. InputError if they take too long or answer no command."""
+    """`make(config)`, after `calls` for a flight at rest; InputError if they are too slow or return no command."""
     follower, count = make(config), len(config.plant.followers)
     shape = (1, OBSERVATION_SIZE) if count == 1 else (1, count, OBSERVATION_SIZE)
     observation, taken = np.zeros(shape), deque[float](maxlen=CALLS)
@@ -129,10 +129,10 @@ def checked(make: Make, config: Config, calls: int = CALLS) -> Follower:
         begun = time.perf_counter()
         answered(follower.name, follower(observation), observation)
         taken.append(time.perf_counter() - begun)
-        slow = [one for one in taken if one > SLOWEST]
+        slow = [one for one in taken if one > MAX_CALL_TIME]
         if len(slow) > CALLS // 2:
             raise InputError(
-                f"follower {follower.name} takes {1e3 * min(slow):.0f} ms a call; at most {1e3 * SLOWEST:.0f} ms"
+                f"follower {follower.name} takes {1e3 * min(slow):.0f} ms a call; at most {1e3 * MAX_CALL_TIME:.0f} ms"
             )
     follower.reset()
     return follower

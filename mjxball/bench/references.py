@@ -1,4 +1,4 @@
-"""The best that classical followers which know the plant reach in the benchmark's flights."""
+"""Results of the classical followers that know the plant, in the benchmark's flights."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mjxball.bench.tracks import worlds_of
 from mjxball.config import Config
 from mjxball.control.followers import Baseline
 
-KNOWING_RIGS = {law.name: law for law in (KnownRigLqg, SlowKnownRigLqg)}
+KNOWN_RIG = {controller.name: controller for controller in (KnownRigLqg, SlowKnownRigLqg)}
 
 
 @functools.cache
 def bars(track: str, draw: int, number: int) -> np.ndarray:
-    """(flights, 3): the `bar` of the flights of a track's world `number`, undisturbed and disturbed ones in turn.
+    """(flights, 3): the `bar` of every flight of a track's world `number`, undisturbed and disturbed in turn.
 
-    The best of the references in each number apart, in the same flight; infinite where all of them failed.
+    Each value is the best of all references in that flight; infinite where all of them failed.
     """
     world = worlds_of(track, draw)[number]
     scenarios = world.reference_scenarios or tuple(one for pair in world.scenarios for one in pair)
@@ -29,5 +29,5 @@ def bars(track: str, draw: int, number: int) -> np.ndarray:
 
 
 def reference(name: str, config: Config) -> Baseline:
-    """The reference of that name, made for the plant of `config`."""
-    return Baseline(KNOWING_RIGS[name](config), config) if name in KNOWING_RIGS else make_baseline(name, config)
+    """The reference called `name`, made for the plant of `config`."""
+    return Baseline(KNOWN_RIG[name](config), config) if name in KNOWN_RIG else make_baseline(name, config)

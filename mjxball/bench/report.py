@@ -1,4 +1,4 @@
-"""The report of scores: one HTML file that works offline, from Jinja2 templates."""
+"""The report of scores: one HTML file that works offline, rendered from Jinja2 templates."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ TEMPLATES = Path(__file__).parent / "templates"
 UNITS = {"rmse": "m", "settling_time": "s", "x_peak": "m", "peak": "m", "max_tilt": "rad", "effort": "N"}
 UNITS |= {"smoothness": "rad", "command_spread": "rad"}
 COUNTED = {"peak": "steady-state peak", "rmse": "RMSE", "settling_time": "settling time", "overshoot": "overshoot"}
-RIVALS = ("adaptive", "lqg", "lqg-slow")  # that followers are compared with one by one
-CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
-LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 3.0  # of the lead picture: steady state, where flights are long
+RIVALS = ("adaptive", "lqg", "lqg-slow")  # followers that others are compared with one by one
+HIDDEN_METADATA = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
+LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 3.0  # of the lead picture: the steady state of long flights
 
 MADE = ("made", "How it was made")  # anchor and heading of the section at the end of every page
 
@@ -41,7 +41,7 @@ def write_report(
     command: str,
     versions: Mapping[str, str],
 ) -> None:
-    """Write `report.html` and `scores.json` into the directory `out`, which is made."""
+    """Write `report.html` and `scores.json` into the directory `out`, which is created."""
     out.mkdir(parents=True, exist_ok=True)
     units = [f"{name} {UNITS.get(name, '')}".strip() for name in RANKED]
     picture, caption = lead_picture(plant, scores, [policy.name for policy in policies])
@@ -79,17 +79,17 @@ def write_page(
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    shown = {p.name: {key: value for key, value in p.card.items() if key not in CARD_HIDES} for p in policies}
+    metadata = {p.name: {key: value for key, value in p.card.items() if key not in HIDDEN_METADATA} for p in policies}
     made = {
         "command": command,
         "versions": json.dumps(dict(versions), indent=1),
-        "cards": {name: json.dumps(card, indent=1, default=str) for name, card in shown.items()},
+        "metadata": {name: json.dumps(one, indent=1, default=str) for name, one in metadata.items()},
     }
     write_whole(path, environment.get_template(template).render(**context, **made))
 
 
 def verdict(scores: Sequence[Score]) -> dict[str, Any]:
-    """The table of followers: wins by each metric of `COUNTED`, failed flights, comparisons with the `RIVALS`."""
+    """The table of followers: wins by each metric of `COUNTED`, failed flights, and comparisons with the `RIVALS`."""
     counts = {metric: wins(scores, metric) for metric in COUNTED}
     names = sorted(counts["peak"], key=lambda name: -counts["peak"][name])
     rivals = [name for name in RIVALS if name in names]
@@ -106,7 +106,7 @@ def verdict(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def wins_by_suite(scores: Sequence[Score]) -> dict[str, Any]:
-    """The table of suites: in how many variants each follower has the smallest steady-state peak."""
+    """The table of suites: the number of variants in which each follower has the smallest steady-state peak."""
     total = wins(scores)
     names, rows = sorted(total, key=lambda name: -total[name]), []
     for suite in dict.fromkeys(score.suite for score in scores):
@@ -119,10 +119,10 @@ def wins_by_suite(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def compare(scores: Sequence[Score], follower: str, rival: str) -> tuple[int, int]:
-    """Variants in which the steady-state peak of `follower` is (smaller, larger) than that of `rival`.
+    """Numbers of variants in which the steady-state peak of `follower` is (smaller, larger) than that of `rival`.
 
-    A follower that failed in any seed of a variant counts as infinitely bad there; variants that one of the two did
-    not fly count for neither.
+    A follower that failed in any seed of a variant counts as infinitely bad there. Variants that one of the two did not
+    fly are not counted.
     """
     smaller = larger = 0
     for group in by_variant(scores).values():
@@ -138,8 +138,8 @@ def lead_picture(plant: Plant, scores: Sequence[Score], policies: Sequence[str])
     (None, reason) if MuJoCo cannot render.
     """
     first = next(iter(by_variant(scores).values()))
-    there = [score.follower for score in first]
-    count = {name: number for name, number in wins(scores).items() if name in there}
+    flown = [score.follower for score in first]
+    count = {name: number for name, number in wins(scores).items() if name in flown}
     classical = [name for name in count if name in LAWS and name not in ("copy", "stay", "random")]
     trained = [name for name in count if name in policies]
     best = [max(names, key=lambda name: count[name]) for names in (trained, classical) if names]

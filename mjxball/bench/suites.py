@@ -1,4 +1,4 @@
-"""Suites: variants of the pair's reference flight along one axis of difficulty each, to see where a follower ends."""
+"""Suites: variants of the pair's reference flight, each suite along one axis of difficulty."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mjxball.sim.scenario import Scenario
 
 @dataclass(frozen=True)
 class Variant:
-    """One case of a suite: a scenario, and the settings that differ from the reference."""
+    """One case of a suite: a scenario, and the settings that differ from the reference configuration."""
 
     label: str
     scenario: Scenario
@@ -26,7 +26,7 @@ class Variant:
 
     @property
     def is_reference(self) -> bool:
-        """Whether it is the reference scenario itself, which several suites have."""
+        """Whether it is the reference scenario, which several suites contain."""
         s, changed = self.scenario, bool(self.changes or self.waveform)
         return not changed and s.believed_mass in (None, s.mass) and s == Scenario(believed_mass=s.believed_mass)
 
@@ -39,7 +39,7 @@ class Variant:
         return configs.validate(base)
 
     def seeded(self, seed: int) -> Scenario:
-        """The scenario of one seed. Seed 0 starts the CG at phase 0, the others at a place drawn from the seed."""
+        """The scenario of one seed. Seed 0 starts the CG at phase 0, other seeds at a random phase."""
         random = np.random.default_rng([seed, 7])
         phase = 0.0 if seed == 0 else float(random.uniform(0, 2 * np.pi))
         # A rolling ball has no phase: it starts on either side, up to 30 % nearer to O.
@@ -56,15 +56,15 @@ class Suite:
 
     name: str
     about: str
-    axis: str  # what the variants' labels say
+    axis: str  # quantity that the variants' labels name
     variants: tuple[Variant, ...]
 
 
-WALK_STEP, WALK_SIGMA = 0.5, 0.03  # time [s] between the samples of a random walk, deviation of one move [m]
+WALK_STEP, WALK_SIGMA = 0.5, 0.03  # of a random walk: time between samples [s], deviation after 1 s [m]
 
 
 def _steps(seed: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """The CG jumps within 0.3 s to a place up to 5 cm from O, every 5 s."""
+    """Times [s] and offsets [m]: every 5 s the CG jumps within 0.3 s to a random place up to 5 cm from O."""
     random = np.random.default_rng([seed, 11])
     places = [0.0, *random.uniform(-0.05, 0.05, 8)]
     times, offsets = [], []
@@ -76,7 +76,7 @@ def _steps(seed: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _walk(seed: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """A random walk within 10 cm of O."""
+    """Times [s] and offsets [m] of a random walk within 10 cm of O."""
     random = np.random.default_rng([seed, 13])
     times = np.arange(0.0, 45.0 + WALK_STEP, WALK_STEP)
     offsets = np.zeros_like(times)
@@ -209,7 +209,7 @@ BY_NAME = {suite.name: suite for suite in SUITES}
 
 
 def list_suites() -> str:
-    """One line for each suite and one for its variants."""
+    """Text with one line for each suite and one for its variants."""
     return "\n".join(
         f"{suite.name}: {suite.about}\n    {suite.axis}: {'; '.join(variant.label for variant in suite.variants)}"
         for suite in SUITES

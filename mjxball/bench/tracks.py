@@ -1,6 +1,6 @@
-"""The flights of mjxball-bench, version 1. Frozen: whoever changes a number here makes another version.
+"""The flights of mjxball-bench, version 1. Frozen: a changed value here makes another version.
 
-A draw is a number; entries of the leaderboard are of draw 0, and any other draw is flights that nobody tuned to.
+A draw is the seed of all flights. The leaderboard uses draw 0; other draws are flights that nobody tuned to.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ from mjxball.sim.scenario import CgPath, Scenario
 ENGINE = "newton-euler"
 SECONDS = 30.0  # of a flight
 FLIGHTS = 120  # of a track, undisturbed, and as many disturbed
-MARGIN = 0.15  # of the rotors' range that the trim of every load leaves
+MARGIN = 0.15  # trim margin of every load, see `plant.trim`
 SPEEDS = (0.2, 3.1)  # of the CG [rad/s]
 AMPLITUDES = (0.02, 0.17)  # of the pair's CG [m]
 MASSES, BELIEVED = (0.1, 0.6), 0.2  # of the pair's object [kg]
 TEAMS = (3, 4, 5, 6)  # drones
-LOADS = (0.5, 1.5)  # a team's object over that of its plant
+LOADS = (0.5, 1.5)  # mass of a team's object over that of its plant
 DIRECTIONS = tuple((math.cos(angle), math.sin(angle)) for angle in np.pi * np.arange(8) / 8)
 RATIOS = (1.0, 1.5, 2.0)  # of both speeds of a path
 RIGS, EACH_RIG = (2, 3, 4, 5, 6), 3  # drones of a rig, flights of each rig
-RIG_LENGTH = 0.17  # [m] of the pair, for which a bar in metres is meant
+RIG_LENGTH = 0.17  # length of the pair, to which criteria in metres refer [m]
 NOISE, DELAY, RIG_DELAY = 1.0, 0.04, 0.02  # level, [s], [s] of random rigs
-THRUST = (0.985, 1.015)  # of the Crazyflies' rotors, over what is asked
+THRUST = (0.985, 1.015)  # factor on the Crazyflies' rotor forces
 CRAZYFLIE = {"noise": 0.5, "estimator_drift": 1.0, "delay": 0.03, "quantize": True}
 LQGS = ("lqg", "lqg-slow", "lqg-offset-free")  # references: classical followers that know the plant
-RIG_LQGS = ("lqg-known-rig", "lqg-slow-known-rig")  # that know the rig
+RIG_LQGS = ("lqg-known-rig", "lqg-slow-known-rig")  # references that know the rig
 Pair = tuple[Scenario, Scenario]  # undisturbed, disturbed
 
 
 @dataclass(frozen=True)
 class World:
-    """Flights on one plant, and who knows that plant."""
+    """Flights on one plant, and the references that know the plant."""
 
     config: Config
     scenarios: tuple[Pair, ...]
     references: tuple[str, ...]  # see `mjxball.bench.references`
-    # What the references fly where the entrant is told less: undisturbed, disturbed.
+    # Scenarios of the references where the entrant knows less: undisturbed, disturbed in turn.
     reference_scenarios: tuple[Scenario, ...] = ()
-    length: float = 1.0  # factor on bars in metres
+    length: float = 1.0  # factor on criteria in metres
 
     def fly(self, followers: Sequence[Follower], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
-        """Metrics of every flight of every follower, in float64."""
+        """Metrics of every flight of every follower, by follower, simulated in float64."""
         flown = simulate_batch(self.config, [(follower, scenarios) for follower in followers], ENGINE)
         plant, count = self.config.plant, len(scenarios)
         limit, most = self.config.scenario.termination_distance, rotor_limits(plant, [*scenarios] * len(followers))
@@ -67,11 +67,11 @@ class World:
 
 @dataclass(frozen=True)
 class Track:
-    """A part of the benchmark, with a number of its own."""
+    """A part of the benchmark with separate results."""
 
     name: str
     title: str
-    worlds: Callable[[int], list[World]]  # of a draw
+    worlds: Callable[[int], list[World]]  # of one draw
 
 
 def _random(draw: int, track: int) -> np.random.Generator:
@@ -79,7 +79,7 @@ def _random(draw: int, track: int) -> np.random.Generator:
 
 
 def _goal(random: np.random.Generator, reach: float = 1.0) -> tuple[float, float, float]:
-    """From 0.3 to 1 times `reach` away along each axis, either way: an overshoot of less is of no size."""
+    """0.3 to 1 times `reach` away along each axis, either way; overshoot is ill-defined for smaller distances."""
     sides = random.choice([-1.0, 1.0], 3)
     x, y, z = map(float, reach * sides * random.uniform(0.3, 1.0, 3))
     return x, y, z
@@ -205,5 +205,5 @@ TRACKS: dict[str, Track] = {
 
 @functools.cache
 def worlds_of(track: str, draw: int) -> list[World]:
-    """The worlds of a track, drawn once."""
+    """The worlds of a track for one draw; cached."""
     return TRACKS[track].worlds(draw)

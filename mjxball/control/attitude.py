@@ -22,10 +22,10 @@ def rotor_commands(
 ) -> Array:
     """Clipped rotor forces (..., 4) [N] for `command` = (roll, pitch [rad], vertical acceleration [m/s2]) (..., 3).
 
-    `euler` = (phi, theta, psi) (..., 3) [rad], body `rates` (..., 3) [rad/s]; `carried_mass` (...) is the drone's
-    own mass plus its share of the believed object mass [kg]. Desired yaw is 0 (paper). All angles are the carrier's;
-    `arm`, `yaw_per_thrust`, `rotor_force_max` and `yaw`, by which a drone is turned on it [rad], are (...) or a float.
-    T = m (g + az) / (cos phi cos theta); tau = Kp (desired - euler) - Kd rates.
+    `euler` = (phi, theta, psi) (..., 3) [rad] and body `rates` (..., 3) [rad/s] are the carrier's; `carried_mass` (...)
+    is the drone's own mass plus its share of the believed object mass [kg]. Desired yaw is 0 (paper). `arm`,
+    `yaw_per_thrust`, `rotor_force_max` and `yaw`, the drone's heading relative to the carrier [rad], are (...) or a
+    float. T = m (g + az) / (cos phi cos theta); tau = Kp (desired - euler) - Kd rates.
     """
     xp = command.__array_namespace__()
     kp, kd = (xp.asarray(gain, dtype=euler.dtype) for gain in gains)

@@ -1,4 +1,4 @@
-"""The attitude of the coupled pair: what its rate loops turn."""
+"""Inertia and control authority of a pair of Crazyflies about roll, pitch and yaw."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ DRONE = np.array([1.66e-5, 1.66e-5, 2.93e-5])  # inertia for which the delivered
 
 
 class Axis(NamedTuple):
-    """One body axis of the coupled pair, both drones' loops giving the same output."""
+    """One body axis of the coupled pair when the loops of both drones give the same output."""
 
     name: str
     inertia: float  # about O, ball at O [kg m2]
     gain: float  # angular acceleration per unit of the rate loops' output [deg/s2]
-    inertia_ratio: float  # inertia that each drone turns over `DRONE`
-    trim: float  # output that holds the heaviest lasting moment: the ball at an end stop [1]
+    inertia_ratio: float  # half of `inertia` over `DRONE`
+    trim: float  # output that holds the largest constant moment: the ball at an end stop [1]
     headroom: float  # output at which a motor of the hovering pair reaches full power [1]
 
 
@@ -34,7 +34,7 @@ def inertia_about_o(config: Config) -> np.ndarray:
 
 
 def axes(config: Config) -> tuple[Axis, ...]:
-    """Roll, pitch and yaw of the pair that `config` describes."""
+    """Roll, pitch and yaw of the pair in `config`."""
     plant = config.plant
     command, slope = hover(config)
     # A roll output moves each motor by half of it, a yaw output by all of it.

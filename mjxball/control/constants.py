@@ -1,4 +1,4 @@
-"""Numbers that follow from a plant and its autopilot: what can be trimmed, hover commands, linearised loops."""
+"""Quantities that follow from a plant and its autopilot: trim limits, hover commands, linearised loops."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def trim_limit(
 ) -> Array:
     """CG offset (...) [m] up to which the follower alone trims the assembly at its goal (ours); negative: nowhere.
 
-    At the goal the leader commands a level hover with its share of the mass (...) that it believes [kg]; `thrust`
-    is what leader's and follower's rotors (...) give of what they are asked for. What is missing of the weight the
-    follower lifts at its own mount, and its pitch torque, 2 (F_max - T / 4) L for an asked thrust T, must hold the
-    moment of that and of the CG with the share `margin` of it left. For training, which needs it traced; rotors that
-    would have to give less than 0 are left out of account, and `mjxball.plant.trim` serves any plant.
+    At the goal the leader commands a level hover with its share of the mass (...) that it assumes [kg]. `thrust` are
+    factors (...) on the rotor forces of leader and follower. The follower lifts the rest of the weight at its mount.
+    Its pitch torque, 2 (F_max - T / 4) L at thrust T, holds the moment of both lifts and of the CG with the share
+    `margin` left. The function can be traced, for training. It ignores that rotor forces cannot be negative;
+    `mjxball.plant.trim` serves any plant.
     """
     believed = object_mass if believed_mass is None else believed_mass
     lead, follow = plant.pair
@@ -43,9 +43,9 @@ def trim_limit(
 
 
 class DroneLoop(NamedTuple):
-    """The linearised cascade of one drone about roll or pitch: kp (asked - angle) - kd rate - kdd rate' + slow z.
+    """Linearised cascade of one drone about roll or pitch: kp (asked - angle) - kd rate - kdd rate' + integral_gain z.
 
-    z is the rate loop's integral, z' = stiffness (asked - angle) - rate, where the drone integrates.
+    z is the integral of the rate loop, z' = stiffness (asked - angle) - rate, if the drone has one.
     """
 
     kp: float  # [N m/rad]
@@ -54,11 +54,11 @@ class DroneLoop(NamedTuple):
     integral_gain: float  # [N m/rad]
     stiffness: float  # kp of the attitude loop [1/s]
     integral_limit: float  # largest |z| [rad]
-    thrust_surplus: float  # thrust that a curved motor gives besides a torque, over its square [1/(N m2)]
+    thrust_surplus: float  # extra thrust of a torque by the motor curve's curvature, over its square [1/(N m2)]
 
 
 def hover(config: Config) -> tuple[float, float]:
-    """(motor command at hover, force of a motor per command there [N]), the mean of both drones."""
+    """Motor command at hover, and force of a motor per command there [N]; the mean of both drones."""
     constants, curve = plant_parameters(config.plant, config.attitude), config.autopilot.motor_curve
     weight = (constants.known_mass + constants.load_share * config.plant.object_mass) * config.plant.gravity
     command = float(crazyflie.motor_command(curve, weight / 4).mean())
@@ -68,18 +68,18 @@ def hover(config: Config) -> tuple[float, float]:
 
 def thrust_slopes(config: Config) -> tuple[float, float]:
     """Thrust per commanded vertical acceleration [kg] of leader and follower near hover."""
-    law, constants = config.autopilot, plant_parameters(config.plant, config.attitude)
-    if law.kind == "crazyflie" and law.thrust_law == "paper":
-        slope = 4 * hover(config)[1] * law.thrust_per_acceleration
+    autopilot, constants = config.autopilot, plant_parameters(config.plant, config.attitude)
+    if autopilot.kind == "crazyflie" and autopilot.thrust_law == "paper":
+        slope = 4 * hover(config)[1] * autopilot.thrust_per_acceleration
         return slope, slope
     leader, follower = map(float, constants.known_mass + constants.load_share * config.plant.object_mass)
     return leader, follower
 
 
 def drone_loop(config: Config, axis: int) -> DroneLoop:
-    """The cascade about `axis` (0 roll, 1 pitch) at hover; attitude ki and kd, which the pair lacks, left out."""
-    law, plant = config.autopilot, config.plant
-    attitude, rate = ((law.roll, law.roll_rate), (law.pitch, law.pitch_rate))[axis]
+    """The cascade about `axis` (0 roll, 1 pitch) at hover, without attitude ki and kd, which the pair does not use."""
+    autopilot, plant = config.autopilot, config.plant
+    attitude, rate = ((autopilot.roll, autopilot.roll_rate), (autopilot.pitch, autopilot.pitch_rate))[axis]
     # A rate loop's output moves each of four motors by half of it; the cascade counts in degrees.
     torque = 4 * lever(plant.arm, plant.layout) / 2 * hover(config)[1] * math.degrees(1)
     return DroneLoop(
@@ -90,5 +90,5 @@ def drone_loop(config: Config, axis: int) -> DroneLoop:
         stiffness=attitude[0],
         integral_limit=math.radians(crazyflie.RATE_LIMITS[axis]),
         # Two motors p up and two p down give 4 a p^2 more than none, p = output / 2 / FULL.
-        thrust_surplus=law.motor_curve[0] * (math.degrees(1) / (torque * crazyflie.FULL)) ** 2,
+        thrust_surplus=autopilot.motor_curve[0] * (math.degrees(1) / (torque * crazyflie.FULL)) ** 2,
     )

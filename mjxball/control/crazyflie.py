@@ -1,8 +1,8 @@
-"""A Crazyflie's own control: setpoint, cascade of attitude and rate PIDs, mixing, motor curve. NumPy and JAX.
+"""A Crazyflie's firmware controller: setpoint, cascade of attitude and rate PIDs, mixing, motor curve. NumPy and JAX.
 
 Written from what the firmware does (bitcraze/crazyflie-firmware 2026.08), in its units: degrees, degrees a second,
-motor commands 0 .. 65535. Its pitch and pitch rate are ours with the opposite sign; its yaw output as well. What one
-drone's loops carry is one array, so that many worlds of two drones are stepped at once.
+motor commands 0 .. 65535. Its pitch, pitch rate and yaw output have the opposite sign of ours. The state of one drone's
+loops is one array, so that batches of flights and drones are stepped at once.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from mjxball.config import Autopilot
 
 PERIOD = 0.002  # [s] of the attitude and rate loops: 500 Hz
 FULL = 65535.0  # motor command of full power
-THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # what the laptop sends while flying; the firmware caps at the second
+THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # range that the laptop sends in flight; the firmware caps at the ceiling
 IDLE = 1000.0  # thrust below which the firmware stops the motors
-TILT_LIMIT = 15.0  # of every roll and pitch that is sent [deg]
+TILT_LIMIT = 15.0  # of every roll and pitch setpoint [deg]
 ATTITUDE_LIMITS = (20.0, 20.0, 360.0)  # of the attitude integrals of roll, pitch, yaw [deg s]
 RATE_LIMITS = (33.3, 33.3, 166.7)  # of the rate integrals [deg]
-LARGEST = 32767.0  # of a rate loop's output
+OUTPUT_LIMIT = 32767.0  # of a rate loop's output
 SIGNS = (1.0, -1.0, 1.0)  # ours -> firmware's roll, pitch, yaw
-TO_FIRMWARE = tuple(sign * 180.0 / math.pi for sign in SIGNS)  # likewise, in degrees
+TO_FIRMWARE = tuple(sign * 180.0 / math.pi for sign in SIGNS)  # ours [rad] -> firmware's [deg]
 # "pid_attitude.roll_kp" -> (field of `Autopilot`, place in it)
 PARAMETERS: dict[str, tuple[str, int]] = {
     f"{group}.{axis}_{gain}": (f"{axis}{suffix}", place)
@@ -34,7 +34,7 @@ PARAMETERS: dict[str, tuple[str, int]] = {
     for axis in ("roll", "pitch", "yaw")
     for place, gain in enumerate(("kp", "ki", "kd"))
 }
-STOCK = Autopilot()  # as delivered
+STOCK = Autopilot()  # the delivered gains
 PAIR = ("leader", "follower")
 
 Gains = dict[str, float]  # parameter name -> value
@@ -42,7 +42,7 @@ PairGains = tuple[Gains, Gains]  # leader, follower
 
 
 class Loops(NamedTuple):
-    """What the cascade of one drone carries, firmware axes; the last axis of the array is these in order."""
+    """State of one drone's cascade, firmware axes; the array's last axis holds these fields in order."""
 
     attitude_integral: Array  # (..., 3) [deg s]
     rate_integral: Array  # (..., 3) [deg]
@@ -52,20 +52,20 @@ class Loops(NamedTuple):
 
 
 def unpack(loops: Array) -> Loops:
-    """`loops` (..., 13) by name."""
+    """Split `loops` (..., 13) into named parts."""
     parts = (loops[..., 0:3], loops[..., 3:6], loops[..., 6:9], loops[..., 9:12], loops[..., 12:13])
     return Loops(*parts)
 
 
 def start_loops(euler: Array, rates: Array) -> Array:
-    """Loops (..., 13) as after a reset: no integral, the yaw held that there is. `euler` [rad], `rates` [rad/s]."""
+    """Loops (..., 13) after a reset: integrals 0, the present yaw is held. `euler` [rad], `rates` [rad/s]."""
     xp = euler.__array_namespace__()
     attitude, turning = to_firmware(euler), to_firmware(rates)
     return xp.concat([xp.zeros_like(euler), xp.zeros_like(euler), attitude, turning, attitude[..., 2:]], axis=-1)
 
 
 def to_firmware(angles: Array) -> Array:
-    """Ours (..., 3) [rad] or [rad/s] in the firmware's axes and degrees."""
+    """`angles` (..., 3) [rad] or [rad/s] in the firmware's axes and degrees."""
     xp = angles.__array_namespace__()
     return angles * xp.asarray(TO_FIRMWARE, dtype=angles.dtype)
 
@@ -85,7 +85,7 @@ def motor_command(curve: tuple[float, float], force: Array) -> Array:
 
 
 def setpoints(autopilot: Autopilot, command: Array, carried_mass: Array, gravity: float) -> Array:
-    """What is sent, (..., 4): roll, pitch [deg], yaw rate [deg/s], thrust, firmware's signs, as the wire carries it.
+    """Setpoints (..., 4) as sent: roll, pitch [deg], yaw rate [deg/s], thrust, in the firmware's signs.
 
     `command` (..., 3) is roll, pitch [rad] and vertical acceleration [m/s2]. Thrust is the paper's, thr_hov + k_pz az,
     or calibrated: the motor curve at T = m (g + az) / (cos roll cos pitch), `carried_mass` m (...) [kg].
@@ -113,40 +113,40 @@ def cascade(
     compensate: Callable[[Array], Array] | None = None,
     rate_share: Array | None = None,
 ) -> tuple[Array, Array]:
-    """(loops (..., 13), motor commands (..., 4)) one tick of 2 ms on.
+    """(loops (..., 13), motor commands (..., 4)) after one tick of 2 ms.
 
-    `setpoint` (..., 4) as from `setpoints`, `euler` (..., 3) [rad] and body `rates` (..., 3) [rad/s] as they are;
-    `integrals` (..., 1), if given, a factor on every ki; `compensate`, if given, turns thrust commands into PWM
-    (`motors.compensated`) before they are capped; `rate_share` (..., 1), if given, a factor on all pid_rate gains.
-    Without thrust the motors stop and the loops are reset.
+    `setpoint` (..., 4) is that of `setpoints`; `euler` (..., 3) [rad] and body `rates` (..., 3) [rad/s] are measured.
+    Optional: `integrals` (..., 1), a factor on every ki; `compensate`, which turns thrust commands into PWM
+    (`motors.compensated`) before they are capped; `rate_share` (..., 1), a factor on all pid_rate gains. Without thrust
+    the motors stop and the loops are reset.
     """
     xp = euler.__array_namespace__()
     old, attitude, turning = unpack(loops), to_firmware(euler), to_firmware(rates)
-    # The wire's yaw rate has the opposite sign; the firmware integrates it into a yaw angle.
+    # The sent yaw rate has the opposite sign; the firmware integrates it into a yaw angle.
     yaw = _wrapped(old.yaw - PERIOD * setpoint[..., 2:3])
-    wanted = xp.concat([setpoint[..., :2], yaw], axis=-1)
+    desired = xp.concat([setpoint[..., :2], yaw], axis=-1)
     outer = (autopilot.roll, autopilot.pitch, autopilot.yaw)
     inner = (autopilot.roll_rate, autopilot.pitch_rate, autopilot.yaw_rate)
-    errors = wanted - attitude
+    errors = desired - attitude
     error = xp.concat([errors[..., :2], _wrapped(errors[..., 2:])], axis=-1)
     moved = attitude - old.attitude
     moved = xp.concat([moved[..., :2], _wrapped(moved[..., 2:])], axis=-1)
-    held, asked = _pid(outer, ATTITUDE_LIMITS, old.attitude_integral, error, moved, integrals)
-    rated = asked - turning, turning - old.rates
-    kept, output = _pid(inner, RATE_LIMITS, old.rate_integral, *rated, integrals)
+    attitude_integral, asked = _pid(outer, ATTITUDE_LIMITS, old.attitude_integral, error, moved, integrals)
+    rate_error = asked - turning
+    rate_integral, output = _pid(inner, RATE_LIMITS, old.rate_integral, rate_error, turning - old.rates, integrals)
     output = output if rate_share is None else rate_share * output
-    output = _whole(clipped(output, -LARGEST, LARGEST), xp.trunc)
+    output = _whole(clipped(output, -OUTPUT_LIMIT, OUTPUT_LIMIT), xp.trunc)
     thrust = setpoint[..., 3]
     on = (thrust >= IDLE)[..., None]
     motors = mix(xp.minimum(thrust, float(THRUST_CEILING)), output, compensate)
-    after = xp.concat([held, kept, attitude, turning, yaw], axis=-1)
+    after = xp.concat([attitude_integral, rate_integral, attitude, turning, yaw], axis=-1)
     if isinstance(on, np.ndarray) and on.all():
         return after, motors
     return xp.where(on, after, start_loops(euler, rates)), xp.where(on, motors, 0.0)
 
 
 def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any, drones: int = 2, leader: int = 0) -> Array:
-    """Factors (N, 1) on ki of every drone: the leader integrates in full."""
+    """Factors (N, 1) on every drone's ki: 1 for the leader, `follower_ki_scale` for the others."""
     shares = [[1.0 if number == leader else autopilot.follower_ki_scale] for number in range(drones)]
     return xp.asarray(shares, dtype=dtype)
 
@@ -154,7 +154,7 @@ def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any, drones: int = 2, 
 def mix(thrust: Array, output: Array, compensate: Callable[[Array], Array] | None = None) -> Array:
     """Motor commands (..., 4) of `thrust` (...) and the rate loops' `output` (..., 3); `compensate` as for `cascade`.
 
-    M1 front right, M2 back right, M3 back left, M4 front left. What is beyond full power is taken off all four.
+    M1 front right, M2 back right, M3 back left, M4 front left. The excess over full power is taken off all four.
     """
     xp = thrust.__array_namespace__()
     roll, pitch = _whole(output[..., 0] / 2, xp.trunc), _whole(output[..., 1] / 2, xp.trunc)
@@ -182,7 +182,7 @@ def _pid(
     moved: Array,
     share: Array | None,
 ) -> tuple[Array, Array]:
-    """(integral, output) (..., 3) of three PIDs whose derivative is that of the measurement, which `moved` [deg]."""
+    """(integral, output) (..., 3) of three PIDs with derivative on the measurement, which changed by `moved` [deg]."""
     xp = error.__array_namespace__()
     kp, ki, kd = (xp.asarray(column, dtype=error.dtype) for column in zip(*gains, strict=True))
     bound = xp.asarray(limits, dtype=error.dtype)
@@ -192,9 +192,9 @@ def _pid(
 
 
 def _whole(value: Array, rounded: Callable[[Array], Array]) -> Array:
-    """`rounded` of a float `value` (...); a gradient passes as if nothing was rounded, where it would else be 0.
+    """`rounded(value)` (...) with the gradient of `value` (straight through), because that of rounding is 0.
 
-    What is cut off is exact in floating point and taken through integers, which no gradient passes.
+    The rounding error is exact in floating point. It is cast through integers, which stops its gradient.
     """
     whole = rounded(value)
     if isinstance(value, np.ndarray | np.generic):
@@ -210,12 +210,12 @@ def _wrapped(angle: Array) -> Array:
 
 
 def gains_of(autopilot: Autopilot) -> Gains:
-    """The firmware parameters that make the leader's cascade that of `autopilot`."""
+    """Firmware parameters of the leader, whose cascade is that of `autopilot`."""
     return {name: getattr(autopilot, field)[place] for name, (field, place) in PARAMETERS.items()}
 
 
 def pair_gains(autopilot: Autopilot) -> PairGains:
-    """Those of leader and follower, whose ki are the leader's times `autopilot.follower_ki_scale`."""
+    """Firmware parameters of leader and follower; the follower's ki are scaled by `autopilot.follower_ki_scale`."""
     leader = gains_of(autopilot)
     share = autopilot.follower_ki_scale
     return leader, {name: value * share if name.endswith("_ki") else value for name, value in leader.items()}
@@ -224,23 +224,23 @@ def pair_gains(autopilot: Autopilot) -> PairGains:
 def read_pair_gains(data: Any) -> PairGains:
     """Gains from JSON: `{"leader": {name: value}, "follower": {name: value}}`, or `{name: value}` for both.
 
-    Raises ValueError if `data` is neither.
+    Raises ValueError for anything else.
     """
     if isinstance(data, dict) and data.keys() == set(PAIR):
-        return _sound(data[PAIR[0]]), _sound(data[PAIR[1]])
-    return _sound(data), _sound(data)
+        return _checked_gains(data[PAIR[0]]), _checked_gains(data[PAIR[1]])
+    return _checked_gains(data), _checked_gains(data)
 
 
 def gains_to_json(gains: PairGains) -> dict[str, Gains]:
-    """What `read_pair_gains` reads."""
+    """JSON object of `gains` for `read_pair_gains`."""
     return dict(zip(PAIR, gains, strict=True))
 
 
-def _sound(data: Any) -> Gains:
-    good = isinstance(data, dict) and all(
+def _checked_gains(data: Any) -> Gains:
+    valid = isinstance(data, dict) and all(
         name.count(".") == 1 and type(value) in (int, float) and math.isfinite(value) for name, value in data.items()
     )
-    if not good:
+    if not valid:
         raise ValueError("parameter names with finite numbers")
     return {name: float(value) for name, value in data.items()}
 
@@ -257,5 +257,5 @@ def with_gains(autopilot: Autopilot, gains: Gains) -> Autopilot:
 
 
 def with_stock_gains(autopilot: Autopilot) -> Autopilot:
-    """`autopilot` with the gains that a firmware starts with."""
+    """`autopilot` with the gains of a newly flashed firmware."""
     return with_gains(autopilot, gains_of(STOCK))

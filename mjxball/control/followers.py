@@ -1,4 +1,4 @@
-"""What flies as a follower: laws as pure functions of NumPy or JAX arrays, and `Baseline`, which remembers for one."""
+"""Interfaces of followers: controllers as pure functions on arrays, and `Baseline`, which keeps one flight's state."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from mjxball.config import Config
 from mjxball.control.observation import OBSERVATION, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
 
-LARGEST = 1e6  # sum of the absolute numbers of an observation: no flight comes near it, and float32 can filter it
+LARGEST = 1e6  # bound of an observation's sum of absolute values: far beyond any flight, fine for float32 filters
 
 
 class PrivilegedInfo(NamedTuple):
-    """What the simulator knows and an observation does not show; every leaf has the observation's batch shape.
+    """Simulator state that an observation does not contain; every leaf has the observation's batch shape.
 
-    Followers may read `believed_mass`. The rest is the truth, of the load half a control step and one rotor lag ahead,
-    for followers with `needs_privileged` alone.
+    Any follower may read `believed_mass`. The other fields are ground truth for followers with `needs_privileged`
+    alone; those of the load are half a control step and one rotor lag ahead.
     """
 
     believed_mass: Array  # (...) mass of the object that the hover thrust assumes [kg]
-    # (...) object mass x CG offset along the line; of teams and in the plane (..., 2) in each mount frame [kg m]
+    # (...) object mass x CG offset on a line; for teams and in the plane (..., 2), in each mount frame [kg m]
     moment: Array
     moment_acceleration: Array  # likewise, object mass x second derivative of the CG offset [kg m/s2]
     total_mass: Array  # (...) of the assembly [kg]
-    thrust: Array | None = None  # (..., N) share of its asked forces that each drone gives now; None: all of them
+    thrust: Array | None = None  # (..., N) present factor on each drone's rotor forces; None: 1
 
 
 class Law(Protocol):
-    """A follower as two pure functions of arrays; `state` is a tuple of arrays (possibly empty)."""
+    """A follower's controller as two pure functions of arrays; `state` is a tuple of arrays (possibly empty)."""
 
     name: str
     needs_privileged: bool  # it reads the true CG from `PrivilegedInfo`
@@ -44,9 +44,9 @@ class Law(Protocol):
 
 
 class Follower(Protocol):
-    """What flies as the follower: a `Baseline`, or `mjxball.policy.Policy`.
+    """A follower that keeps its state: a `Baseline`, or `mjxball.policy.Policy`.
 
-    Several followers of a team are called at once, as one batch axis more, each in its mount frame.
+    The followers of a team are called at once along one more batch axis, each with values in its mount frame.
     """
 
     name: str
@@ -57,36 +57,36 @@ class Follower(Protocol):
     def __call__(self, observation: Array) -> Array:
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18).
 
-        Raises InputError for what is no observation (`checked_observation`), and remembers nothing of it.
+        Raises InputError for an invalid observation (`checked_observation`) and leaves the state as it was.
         """
 
 
 def checked_observation(observation: Array) -> np.ndarray:
-    """`observation` (..., 18) as float64; InputError, with the name of the number, unless a follower may see it.
+    """`observation` (..., 18) as float64. Raises InputError that names the bad component if it is invalid.
 
-    Real numbers, finite, their absolute sum below `LARGEST`. A follower that filters what it sees would otherwise
-    remember one such number for the rest of the flight.
+    Valid are finite real values with an absolute sum below `LARGEST`. A follower that filters observations would
+    otherwise carry one bad value for the rest of the flight.
     """
     given = real_numbers(observation, "an observation")
     if given.shape[-1:] != (OBSERVATION_SIZE,):
         raise InputError(f"observation must have {OBSERVATION_SIZE} numbers last, not shape {given.shape}")
-    seen = given.astype(np.float64)
+    values = given.astype(np.float64)
     if given.ndim == 1:
-        sound = sum(map(abs, seen.tolist())) < LARGEST  # of so few numbers a third of the time that NumPy needs
+        valid = sum(map(abs, values.tolist())) < LARGEST  # for so few values three times as fast as NumPy
     else:
-        sound = bool((np.abs(seen).sum(axis=-1) < LARGEST).all())
-    if not sound:
-        size = np.where(np.isnan(seen), np.inf, np.abs(seen))
-        value, (name, unit) = seen.flat[int(size.argmax())], OBSERVATION[int(size.argmax()) % OBSERVATION_SIZE]
+        valid = bool((np.abs(values).sum(axis=-1) < LARGEST).all())
+    if not valid:
+        size = np.where(np.isnan(values), np.inf, np.abs(values))
+        value, (name, unit) = values.flat[int(size.argmax())], OBSERVATION[int(size.argmax()) % OBSERVATION_SIZE]
         raise InputError(
             f"an observation has {value:g} for {name} [{unit}], which no flight has; it was not answered, and nothing "
             "of it is remembered: call again with the next good one"
         )
-    return seen
+    return values
 
 
 def checked_command(name: str, command: Any, observation: np.ndarray) -> np.ndarray:
-    """`command` (..., 3) of follower `name` to `observation` (..., 18) as float64; InputError if it is none."""
+    """`command` (..., 3) of follower `name` to `observation` (..., 18) as float64; InputError if it is not one."""
     array, wanted = real_numbers(command, f"the answer of follower {name}"), (*observation.shape[:-1], 3)
     if array.shape != wanted:
         raise InputError(f"follower {name} answered shape {array.shape} where {wanted} was wanted")
@@ -94,7 +94,7 @@ def checked_command(name: str, command: Any, observation: np.ndarray) -> np.ndar
 
 
 def check_batch(name: str, remembered: tuple[int, ...], observation: np.ndarray) -> None:
-    """Raise InputError unless `observation` (..., 18) is of the flights of shape `remembered` (...) of `name`."""
+    """Raise InputError unless `observation` (..., 18) has the batch shape `remembered` of the flights of `name`."""
     if observation.shape[:-1] != remembered:
         wanted = (*remembered, OBSERVATION_SIZE)
         raise InputError(
@@ -106,10 +106,10 @@ _OF_THREAD = threading.local()
 
 
 class OneThread:
-    """The thread whose flight a follower remembers: the first that calls it after a reset.
+    """The thread whose flight a follower keeps state for: the first that calls it after a reset.
 
-    Two threads that call one follower by turns would each be answered from a mixture of both flights. A thread is known
-    by an object of its own: its number, and what `threading` says of it, are given to a later one when it has ended.
+    Two threads that call one follower in turn would each get answers from a mixture of both flights. Each thread is
+    known by an object in its thread-local storage, because thread numbers are reused when a thread has ended.
     """
 
     def __init__(self) -> None:
@@ -126,18 +126,18 @@ class OneThread:
             )
 
     def forget(self) -> None:
-        """Any thread may be the next."""
+        """Let any thread be the next to call."""
         self._of = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which any thread may take."""
+        """A copy may be called by any thread."""
         return {"_of": {}}
 
 
 class Baseline:
     """A `Law` with its state, for one flight of one thread at a time (see `OneThread`); `law` itself is pure.
 
-    Set `privileged` before a call; without it the plant's own mass is believed.
+    Set `privileged` before a call; without it the mass of `config.plant` is assumed.
     """
 
     def __init__(self, law: Law, config: Config):
@@ -154,11 +154,11 @@ class Baseline:
         self._thread.forget()
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which go on by themselves."""
+        """A copy keeps the flight's state and may be called by any thread."""
         return {**self.__dict__, "_thread": OneThread()}
 
     def __call__(self, observation: Array) -> Array:
-        """See `Follower.__call__`. Raises InputError if the law needs `privileged` and it is not set."""
+        """See `Follower.__call__`. Raises InputError if the controller needs `privileged` and it is not set."""
         observation = checked_observation(observation)
         if self._state is None:
             self._state, self._batch = self.law.start(observation), observation.shape[:-1]
@@ -177,7 +177,7 @@ class Baseline:
 
 
 class Copy:
-    """The leader's PD law on the follower's own observation: the optimum of the paper's reward."""
+    """The leader's PD controller on the follower's own observation: the optimum of the paper's reward."""
 
     name = "copy"
     needs_privileged = False
@@ -196,5 +196,5 @@ class Copy:
 
 def copy_gains(config: Config) -> tuple[Any, ...]:
     """The arguments of `observation.copy_command` after the observation, for the configured leader."""
-    law, limits = config.leader, config.command
-    return law.kp, law.kd, config.plant.gravity, limits.tilt_limit, limits.vertical_limit
+    leader, limits = config.leader, config.command
+    return leader.kp, leader.kd, config.plant.gravity, limits.tilt_limit, limits.vertical_limit

@@ -1,4 +1,4 @@
-"""The leader's law: PID on the object's error (paper eq. 5), then roll and pitch from the linearised dynamics."""
+"""The leader's controller: PID on the object's error (paper eq. 5), then roll and pitch by the linearised dynamics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gains for the coupled pair: the stiffest attitude loop that keeps stated margins over what is not known."""
+"""Attitude gains for a pair of Crazyflies: the stiffest loop with margins for uncertain lag, inertia and delay."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Gains(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """How far a stable loop is from instability; all 0 for an unstable one."""
+    """Stability margins of a loop; all 0 if it is unstable."""
 
     phase: float  # [deg]
     gain_up: float  # factor on the loop's gain
@@ -34,9 +34,9 @@ class Margins(NamedTuple):
 
 
 def loop_gain(gains: Gains, gain: float, lag: float, delay: float, frequency: Array) -> Array:
-    """L (k,) at `frequency` (k,) [rad/s], the loop cut at the motor commands.
+    """Loop gain L (k,) at `frequency` (k,) [rad/s], with the loop cut at the motor commands.
 
-    `gain` [deg/s2] of the axis per unit, `lag` and `delay` [s]. Both derivatives are the measurement's.
+    `gain` of the axis in [deg/s2] per unit, `lag` and `delay` in [s]. Both derivatives act on the measurement.
     """
     s = 1j * frequency
     (ap, ai, ad), (rp, ri, rd) = gains
@@ -46,27 +46,27 @@ def loop_gain(gains: Gains, gain: float, lag: float, delay: float, frequency: Ar
 
 
 def closed_poles(gains: Gains, gain: float, lag: float, delay: float) -> Array:
-    """Poles of the closed loop [1/s], the delay in its third-order Padé form."""
+    """Poles of the closed loop [1/s], with a third-order Padé approximation of the delay."""
     (ap, ai, ad), (rp, ri, rd) = gains
     poly = np.polynomial.polynomial
-    # The controller is number / s^3 and the axis gain / (s (lag s + 1)); ascending powers of s.
-    number = poly.polyadd(poly.polymul([ri, rp], [ai, ap, 1 + ad]), [0, 0, 0, 0, rd])
-    bottom = poly.polymul([0, 0, 0, 0, 1], [1, lag])
+    # The controller is numerator / s^3, the axis is gain / (s (lag s + 1)); ascending powers of s.
+    numerator = poly.polyadd(poly.polymul([ri, rp], [ai, ap, 1 + ad]), [0, 0, 0, 0, rd])
+    denominator = poly.polymul([0, 0, 0, 0, 1], [1, lag])
     pade = np.array([120, 60 * delay, 12 * delay**2, delay**3])
-    top = poly.polymul(gain * number, pade * [1, -1, 1, -1])
-    # Without the integrators that are not there; those of angle and rate stay, also where nothing feeds them back.
+    top = poly.polymul(gain * numerator, pade * [1, -1, 1, -1])
+    # Drop the integrators whose gain is 0; those of angle and rate stay, also without feedback.
     absent = (ai == 0) + (ri == 0)
-    whole: Array = np.trim_zeros(poly.polyadd(top, poly.polymul(bottom, pade))[absent:], "b")
-    return poly.polyroots(whole)
+    characteristic: Array = np.trim_zeros(poly.polyadd(top, poly.polymul(denominator, pade))[absent:], "b")
+    return poly.polyroots(characteristic)
 
 
 def is_stable(gains: Gains, gain: float, lag: float, delay: float) -> bool:
-    """Whether all poles of the closed loop lie left."""
+    """Whether all poles of the closed loop have negative real parts."""
     return bool((closed_poles(gains, gain, lag, delay).real < 0).all())
 
 
 def unstable_axes(config: Config) -> list[str]:
-    """Axes about which the gains of a pair of Crazyflies do not hold it, at the nominal delay; none for others."""
+    """Axes about which a pair of Crazyflies is unstable at the nominal delay; empty for other plants."""
     if config.autopilot.kind != "crazyflie" or config.plant.count != 2:
         return []
     lag, delay = config.plant.rotor_lag, REQUIREMENTS.delay
@@ -76,7 +76,7 @@ def unstable_axes(config: Config) -> list[str]:
 
 
 def margins(gains: Gains, gain: float, lag: float, delay: float) -> Margins:
-    """Margins of the loop; found on a grid of frequencies, good to 1 %."""
+    """Margins of the loop, from a grid of frequencies and good to 1 %."""
     if not is_stable(gains, gain, lag, delay):
         return Margins(0.0, 0.0, 0.0, 0.0, 0.0)
     value = loop_gain(gains, gain, lag, delay, FREQUENCIES)
@@ -99,11 +99,11 @@ def margins(gains: Gains, gain: float, lag: float, delay: float) -> Margins:
 
 @dataclass(frozen=True)
 class Requirements:
-    """What is required of every axis. `worst` is each margin's smallest over the corners of what is not known."""
+    """Margins required of every axis; `worst` ones are minima over the corners of `lags` and `inertias`."""
 
-    delay: float = 0.01  # of the loop itself: filters, estimator, sampling, motor drivers [s]
+    delay: float = 0.01  # nominal delay: filters, estimator, sampling, motor drivers [s]
     phase: float = 50.0  # at nominal lag, inertia and delay [deg]
-    gain: float = 3.0  # either way, likewise
+    gain: float = 3.0  # up and down, likewise
     worst_phase: float = 15.0  # [deg]
     worst_gain: float = 2.0
     worst_delay: float = 0.02  # [s]
@@ -111,7 +111,7 @@ class Requirements:
     inertias: tuple[float, float] = (0.6, 1.4)  # factors
     attitude_error: float = 5.0  # attitude error that may take half of the headroom [deg]
     bandwidth_ratio: float = 4.0  # the rate loop's bandwidth over the attitude loop's, at least
-    largest_derivative: float = 30.0  # largest kd of a rate loop, twelve times the delivered one: noise of the gyro
+    largest_derivative: float = 30.0  # largest kd of a rate loop, for gyro noise; twelve times the delivered one
     keep_below: float = 1.5  # an axis whose inertia is less than this times the drones' own keeps the delivered gains
     unloaded_share: float = 0.15  # share of the headroom that the integral of an axis without a load may take
 
@@ -120,12 +120,12 @@ REQUIREMENTS = Requirements()
 
 
 class Design(NamedTuple):
-    """Gains of one axis and what they are worth."""
+    """Gains of one axis and their margins."""
 
     axis: Axis
     gains: Gains
     nominal: Margins
-    worst: Margins  # each the smallest of the corners
+    worst: Margins  # the smallest of each margin over the corners
 
 
 def design(config: Config) -> tuple[Design, ...]:
@@ -136,9 +136,9 @@ def design(config: Config) -> tuple[Design, ...]:
 def design_axis(axis: Axis, config: Config) -> Design:
     """The stiffest of a grid of gains: rate kp, its kd as a lead, attitude kp.
 
-    The rate integral alone holds lasting moments, sized for `Axis.trim`: both drones turn one body, so that the
-    integrals of two drones that see it differently run apart, and what they fight with must stay bounded.
-    An axis that both turn as each does alone keeps the delivered gains, which are flown everywhere.
+    Only the rate integral holds constant moments; it is sized for `Axis.trim`. Both drones turn one body, so the
+    integrals of two drones that measure it differently drift apart and oppose each other, and that has to stay bounded.
+    An axis with about the inertia of two single drones keeps the delivered gains, which many have flown.
     """
     if axis.inertia_ratio < REQUIREMENTS.keep_below:
         return Design(
@@ -162,13 +162,13 @@ def design_axis(axis: Axis, config: Config) -> Design:
 
 
 def candidates(axis: Axis, lag: float) -> list[tuple[float, float, float]]:
-    """(attitude kp, rate kp, lead time) within authority and noise, the stiffest first."""
+    """(attitude kp, rate kp, lead time) within the limits of authority and noise, the stiffest first."""
     stiffest = 0.5 * axis.headroom / REQUIREMENTS.attitude_error
     rates, leads = np.geomspace(2.0, 60.0, 35) / axis.gain, np.linspace(0.0, lag, 6)
     grid = itertools.product(np.geomspace(0.8, 8.0, 24), rates, leads)
     stable = ((a, r, d) for a, r, d in grid if REQUIREMENTS.bandwidth_ratio * a <= r * axis.gain)
     kept = [(a, r, d) for a, r, d in stable if a * r <= stiffest and d * r <= REQUIREMENTS.largest_derivative]
-    # Among the equally stiff the one with less lead, which is less noise.
+    # Among equally stiff ones less lead first, which means less noise.
     return sorted(((float(a), float(r), float(d)) for a, r, d in kept), key=lambda c: (-c[0] * c[1], c[2]))
 
 
@@ -180,12 +180,12 @@ def worst_margins(gains: Gains, axis: Axis) -> Margins:
 
 
 def nominal_and_worst(gains: Gains, axis: Axis, lag: float) -> tuple[Margins, Margins]:
-    """(nominal, worst) margins."""
+    """Nominal margins, and the worst over the corners."""
     return margins(gains, axis.gain, lag, REQUIREMENTS.delay), worst_margins(gains, axis)
 
 
 def rounded(gains: Gains) -> Gains:
-    """To three significant digits, as they are written to the drones."""
+    """`gains` to three significant digits, as they are written to the drones."""
     attitude, rate = ([float(f"{value:.3g}") for value in row] for row in gains)
     return Gains((attitude[0], attitude[1], attitude[2]), (rate[0], rate[1], rate[2]))
 

@@ -19,9 +19,8 @@ def wrench_from_rotors(force: Array, arm: Array | float, yaw_per_thrust: Array |
 
 
 def turned(wrench: Array, yaw: Array | float) -> Array:
-    """`wrench` = (T, tau_x, tau_y, tau_z) (..., 4) in axes that are turned by -`yaw` (...) about z [rad].
-
-    The wrench of a drone that is turned by `yaw`, in the carrier's axes.
+    """`wrench` = (T, tau_x, tau_y, tau_z) (..., 4) of a drone turned by `yaw` (...) [rad] about z, in the carrier's
+    axes.
     """
     if isinstance(yaw, float) and yaw == 0.0:
         return wrench
@@ -45,5 +44,5 @@ def rotors_from_wrench(wrench: Array, arm: Array | float, yaw_per_thrust: Array 
 
 
 def torque_per_force(arm: Any, layout: str) -> Any:
-    """Roll or pitch torque per force [m] that a drone has: times (F_max - T / 4) it is the largest at thrust T."""
+    """Lever [m] of roll or pitch torque: times F_max - T / 4 it is a drone's largest torque at thrust T."""
     return (2 if layout == "plus" else 4) * lever(arm, layout)

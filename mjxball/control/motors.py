@@ -2,7 +2,7 @@
 
 The force follows the voltage at the motor, duty cycle times battery voltage. With battery compensation the firmware
 takes a thrust command as a share of `Motor.max_force` and computes the duty cycle (PWM) that gives this force at the
-battery's present voltage. Without it, the thrust command is the PWM. NumPy and JAX arrays of any shape.
+battery's present voltage. Without it the thrust command is the PWM. NumPy and JAX arrays of any shape.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from mjxball.control import crazyflie
 from mjxball.control.constants import hover
 
 FULL = crazyflie.FULL  # PWM of full power, and thrust command of full thrust
-USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn or measured
+USUAL_BATTERY = 3.7  # [V] in hover, used if no voltage is sampled or measured
 Curve = tuple[float, float]  # force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]
 OLDER: Curve = (0.0915, 0.0677)  # a 2.1's firmware without battery compensation
-LARGEST_HOVER = 60000.0  # of the paper's law, as the firmware caps it
+LARGEST_HOVER = 60000.0  # of the paper's thrust map, the firmware's cap
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def compensates(curve: Curve) -> bool:
 
 
 def firmware(config: Config) -> dict[str, Any]:
-    """What a card says about the firmware that its gains and thrust map are for, and which others they convert to.
+    """Metadata of a policy file on the firmware that its gains and thrust map are for, and those that they convert to.
 
     `drone` is a name of `motors.MOTORS`; `curve` is linear (with battery compensation) or older (without).
     """
@@ -115,29 +115,30 @@ def slope(curve: Curve, command: float) -> float:
 
 
 def with_curve(config: Config, curve: Curve) -> Config:
-    """`config` for the same drones with a firmware of motor `curve`: the closed loop about hover stays what it was.
+    """`config` for the same drones with a firmware of motor `curve`; the closed loop about hover stays the same.
 
     The thrust map takes the new curve; pid_rate.* are scaled by the ratio of both curves' slopes at hover; the paper's
-    thrust law gets the hover thrust and the units per acceleration that give the same force and the same slope.
+    thrust map gets the hover thrust and the units per acceleration that give the same force and the same slope.
     """
-    law = config.autopilot
+    autopilot = config.autopilot
     curve = (float(curve[0]), float(curve[1]))
-    if curve == law.motor_curve:
+    if curve == autopilot.motor_curve:
         return config
     changed = dataclasses.replace(
         config,
         plant=dataclasses.replace(config.plant, rotor_force_max=sum(curve)),
-        autopilot=dataclasses.replace(law, motor_curve=curve),
+        autopilot=dataclasses.replace(autopilot, motor_curve=curve),
     )
     ratio = hover(config)[1] / hover(changed)[1]
-    roll, pitch, yaw = ((ratio * p, ratio * i, ratio * d) for p, i, d in (law.roll_rate, law.pitch_rate, law.yaw_rate))
-    force = crazyflie.motor_force(law.motor_curve, law.hover_thrust)
+    loops = (autopilot.roll_rate, autopilot.pitch_rate, autopilot.yaw_rate)
+    roll, pitch, yaw = ((ratio * p, ratio * i, ratio * d) for p, i, d in loops)
+    force = crazyflie.motor_force(autopilot.motor_curve, autopilot.hover_thrust)
     level = float(crazyflie.motor_command(curve, np.float64(force)))
     scaled = dataclasses.replace(
         changed.autopilot,
         hover_thrust=min(level, LARGEST_HOVER),
-        thrust_per_acceleration=law.thrust_per_acceleration
-        * slope(law.motor_curve, law.hover_thrust)
+        thrust_per_acceleration=autopilot.thrust_per_acceleration
+        * slope(autopilot.motor_curve, autopilot.hover_thrust)
         / slope(curve, level),
         roll_rate=roll,
         pitch_rate=pitch,

@@ -8,7 +8,7 @@ from mjxball.arrays import Array, clipped, joined
 def rotate(matrix: Array, vector: Array) -> Array:
     """R v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3).
 
-    A sum of products: of one small matrix product a world XLA makes a call each, in TF32 on a GPU.
+    Written as a sum of products: XLA makes each small matrix product a separate call, in TF32 on a GPU.
     """
     return (matrix * vector[..., None, :]).sum(axis=-1)
 
@@ -19,7 +19,7 @@ def rotate_back(matrix: Array, vector: Array) -> Array:
 
 
 def turned_about_z(vectors: Array, angle: Array) -> Array:
-    """Every three numbers of `vectors` (..., 3 k) as a vector, turned by `angle` (...) about z [rad]."""
+    """`vectors` (..., 3 k), k vectors side by side, each turned by `angle` (...) about z [rad]."""
     xp = vectors.__array_namespace__()
     angle = xp.asarray(angle, dtype=vectors.dtype)[..., None]
     c, s = xp.cos(angle), xp.sin(angle)
@@ -93,8 +93,8 @@ def roll_of_quaternion(quaternion: Array) -> Array:
 def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
     """q exp(rotation / 2), normalised: turn `quaternion` (..., 4) by the body-axes vector `rotation` (..., 3) [rad].
 
-    The exponential's sine and cosine are Taylor sums in |rotation|^2, smooth at zero and exact to 1e-16
-    for |rotation| <= 0.5 rad, far beyond what one physics step turns.
+    The exponential's sine and cosine are Taylor sums in |rotation|^2, smooth at zero and exact to 1e-16 for |rotation|
+    <= 0.5 rad, far more than the rotation in one physics step.
     """
     xp = quaternion.__array_namespace__()
     h2 = dot(rotation, rotation)[..., None] / 4

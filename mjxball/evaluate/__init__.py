@@ -1,1 +1,1 @@
-"""Evaluation: scenarios, benchmark suites, metrics, figures, and the report."""
+"""Evaluation: scenarios, metrics, results, figures and rendered flights."""

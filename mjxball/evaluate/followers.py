@@ -1,4 +1,4 @@
-"""Followers of the user's own, `module:Class`, beside the classical ones: found by name, every answer checked."""
+"""Followers by name: classical ones, and a user's `module:Class`, whose answers are checked."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower, checked_command
 from mjxball.errors import FOREIGN, InputError, said
 
-LARGEST = 1e9  # of a command, in rad and m/s^2; the square of what is larger is soon no number
+MAX_COMMAND = 1e9  # of a command, in rad and m/s2; larger values soon overflow when squared
 PACKAGE = Path(__file__).parents[1]
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
 
 def find_follower(text: str, flag: str) -> tuple[str, Make]:
-    """(name, what makes it for a plant) of a classical follower, or of the class that `text` = module:Class names.
+    """(name, function that makes it for a plant) of a classical follower or of the class `text` = module:Class.
 
-    Such a class is called with the `Config` and is a law (`mjxball.control.followers.Law`) or a follower
-    (`Follower`). Raises InputError, which says `flag`, if there is none of that name.
+    The class is called with the `Config` and is a `mjxball.control.followers.Law` or a `Follower`. Raises InputError,
+    which names the flag `flag`, if there is none of that name.
     """
     if text in LAWS or ":" not in text:
         return text, lambda config: make_baseline(text, config)
     from mjxball.train.extensions import find  # with JAX
 
     made, name = find(text, flag), text.rpartition(":")[2]
-    return name, lambda config: _outside(name, made, config)
+    return name, lambda config: _user_follower(name, made, config)
 
 
-class Outside:
-    """A follower from outside, whose every answer is checked."""
+class UserFollower:
+    """A user's `Follower` whose answers are checked."""
 
     def __init__(self, name: str, answer: Any):
         self.name, self._answer = name, answer
@@ -44,39 +44,39 @@ class Outside:
         _guarded(self.name, self._answer.reset)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """See `Follower.__call__`; InputError if it raises, or answers what is no command."""
-        own = np.array(observation)  # which it may write to
-        return answered(self.name, _guarded(self.name, self._answer, own, given=observation), observation)
+        """See `Follower.__call__`; InputError if it raises or returns no command."""
+        copied = np.array(observation)  # the user's code may write to it
+        return answered(self.name, _guarded(self.name, self._answer, copied, given=observation), observation)
 
 
-class OutsideLaw:
-    """A law from outside, likewise."""
+class UserController:
+    """A user's `Law` whose answers are checked."""
 
-    def __init__(self, name: str, law: Any):
-        self.name, self._law = name, law
-        self.needs_privileged = bool(_guarded(name, getattr, law, "needs_privileged", False))
+    def __init__(self, name: str, controller: Any):
+        self.name, self._controller = name, controller
+        self.needs_privileged = bool(_guarded(name, getattr, controller, "needs_privileged", False))
 
     def start(self, observation: Any) -> Any:
         """See `Law.start`."""
-        return _guarded(self.name, self._law.start, observation, given=observation)
+        return _guarded(self.name, self._controller.start, observation, given=observation)
 
     def step(self, state: Any, observation: Any, privileged: Any) -> Any:
         """See `Law.step`."""
-        answer = _guarded(self.name, self._law.step, state, observation, privileged, given=observation)
+        answer = _guarded(self.name, self._controller.step, state, observation, privileged, given=observation)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise InputError(
-                f"follower {self.name} answered {type(answer).__name__}; a law's step gives (state, command)"
+                f"follower {self.name} answered {type(answer).__name__}; step must return (state, command)"
             )
         return answer[0], answered(self.name, answer[1], observation)
 
 
-def _outside(name: str, made: Any, config: Config) -> Follower:
+def _user_follower(name: str, made: Any, config: Config) -> Follower:
     found = _guarded(f"{name}(config)", made, config)
     has = {part for part in ("start", "step", "reset") if callable(_guarded(name, getattr, found, part, None))}
     if has >= {"start", "step"}:
-        return Baseline(OutsideLaw(name, found), config)
+        return Baseline(UserController(name, found), config)
     if callable(found) and "reset" in has:
-        return Outside(name, found)
+        return UserFollower(name, found)
     raise InputError(
         f"follower {name} has neither start and step nor reset and __call__; see docs/howto/own-baseline.md"
     )
@@ -95,13 +95,13 @@ def _guarded(name: str, function: Any, *arguments: Any, given: Any = None) -> An
 
 
 def _is_ours(file: str) -> bool:
-    """Whether a source file is mjxball's or an installed library's, not the user's."""
+    """Whether a source file belongs to mjxball or an installed library, not to the user."""
     return Path(file).is_relative_to(PACKAGE) or "site-packages" in file
 
 
 def answered(name: str, command: Any, observation: np.ndarray) -> np.ndarray:
-    """`checked_command` of follower `name`; InputError also if it is not finite, or beyond `LARGEST`."""
+    """`checked_command` of follower `name`; InputError also if it is not finite or exceeds `MAX_COMMAND`."""
     found = checked_command(name, command, observation)
-    if not (np.abs(found) <= LARGEST).all():
-        raise InputError(f"follower {name} answered a number that is not finite, or larger than {LARGEST:g}")
+    if not (np.abs(found) <= MAX_COMMAND).all():
+        raise InputError(f"follower {name} answered a number that is not finite, or larger than {MAX_COMMAND:g}")
     return found

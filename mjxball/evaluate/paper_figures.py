@@ -1,4 +1,4 @@
-"""The paper's figures from our own flights: reward, adaptive, speeds, masses, stand (`eval.py figures`)."""
+"""The paper's figures from our flights: reward, adaptive, speeds, masses, stand (`eval.py figures`)."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ CHANGES = {
     f"{', '.join(f'{mass:+g} kg at {time:g} s' for time, mass in changes)}": Scenario(mass_changes=changes)
     for changes in (((15.0, 0.1),), ((15.0, -0.1),), ((12.0, 0.1), (24.0, -0.1)))
 }
-LETTERS = {"font.size": 8, "axes.titlesize": 8.5}  # [pt], on a screen
-FOLLOWING = 3.0  # [s], of errors that swing fast
-SWING = 0.01  # [m] on either side of the goal
-LINEAR = 10.0  # returns nearer to 0 are drawn on a linear scale, the others on a logarithmic one
+FONTS = {"font.size": 8, "axes.titlesize": 8.5}  # fonts of the style `screen` [pt]
+ERROR_WINDOW = 3.0  # window of the largest error, for errors that oscillate fast [s]
+SWING = 0.01  # smallest distance of a swing from the goal [m]
+LINEAR = 10.0  # returns nearer to 0 are plotted on a linear scale, the others on a logarithmic one
 
 
 def on_stand(policy: Policy) -> bool:
@@ -59,12 +59,12 @@ def draw_figure(name: str, policies: Sequence[Policy], physics: str, look: str =
         "masses": lambda: draw_masses(free, physics),
         "stand": lambda: draw_stand([policy for policy in policies if on_stand(policy)], physics),
     }
-    with style(look), pyplot().rc_context(LETTERS if look == "screen" else {}):
+    with style(look), pyplot().rc_context(FONTS if look == "screen" else {}):
         return makers[name]()
 
 
 def check_figures(names: Sequence[str], policies: Sequence[Policy]) -> None:
-    """Raise InputError if one of the figures `names` lacks a policy or a sound training curve."""
+    """Raise InputError if one of the figures `names` lacks a policy or a valid training curve."""
     needy = [name for name in names if name in ("adaptive", "speeds", "masses")]
     if needy and all(on_stand(policy) for policy in policies):
         raise InputError(f"figure {needy[0]} needs a policy made for free flight")
@@ -76,7 +76,7 @@ def check_figures(names: Sequence[str], policies: Sequence[Policy]) -> None:
 
 @dataclass(frozen=True)
 class Curve:
-    """The training curve in a policy's card."""
+    """The training curve stored in a policy file's metadata."""
 
     steps: list[float]
     returns: list[float]  # of the exploring policy
@@ -85,20 +85,20 @@ class Curve:
 
 
 def read_curve(policy: Policy) -> Curve | None:
-    """The curve in the card of `policy`, None if it has none; InputError if it is unsound."""
+    """The training curve of `policy`, None if its file has none; InputError if it is invalid."""
     stored = policy.card.get("curve")
     if stored is None:
         return None
     named = ("steps", "episode_return", "eval_steps", "eval_return")
     columns: list[Any] = [stored.get(name) for name in named] if isinstance(stored, dict) else []
-    sound = bool(columns) and all(isinstance(column, list) and all(map(_is_number, column)) for column in columns)
-    if not sound or not columns[0] or [*map(len, columns[::2])] != [*map(len, columns[1::2])]:
+    valid = bool(columns) and all(isinstance(column, list) and all(map(_is_number, column)) for column in columns)
+    if not valid or not columns[0] or [*map(len, columns[::2])] != [*map(len, columns[1::2])]:
         raise InputError(f"the card of policy {policy.name} has an unsound training curve")
     return Curve(*columns)
 
 
 def draw_reward(policies: Sequence[Policy]) -> Figure:
-    """Return of an episode over training, one panel for each policy."""
+    """Return of an episode during training, one panel per policy."""
     from matplotlib.ticker import EngFormatter
 
     curves = [(policy, curve) for policy in policies if (curve := read_curve(policy))]
@@ -129,7 +129,7 @@ def draw_reward(policies: Sequence[Policy]) -> Figure:
 
 
 def draw_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
-    """The policies beside `copy` and `adaptive` on the reference scenario."""
+    """The policies, `copy` and `adaptive` on the reference scenario."""
     setup = configs.preset("paper")
     followers: list[Follower] = [make_baseline("copy", setup), make_baseline("adaptive", setup), *policies]
     results = fly_scenarios(setup, followers, [REFERENCE], physics)
@@ -154,31 +154,31 @@ def draw_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
 
 
 def swings(error: np.ndarray) -> int:
-    """Passages of e_o (T, 3) from beyond `SWING` on one side of zero to beyond it on the other, summed over axes."""
+    """Number of swings of e_o (T, 3) from beyond `SWING` on one side of zero to the other side, summed over axes."""
     sides = [np.sign(along[np.abs(along) > SWING]) for along in error.T]
     return sum(int(np.count_nonzero(np.diff(side))) for side in sides)
 
 
 def draw_speeds(policies: Sequence[Policy], physics: str) -> Figure:
-    """Five CG speeds: each policy a column, copying the last one."""
+    """Flights with five CG speeds, one column per policy, and one for `copy`."""
     setup = configs.preset("paper")
     columns = _fly([*policies, make_baseline("copy", setup)], SPEEDS, physics)
     caption = (
         "Position of O, goal dotted, and its largest distance from there in the next 3 s, for five speeds of the CG: "
         "±0.05 m along the rod, object of 0.2 kg."
     )
-    return _variations("speeds", "CG speeds", 4, columns, caption, FOLLOWING)
+    return _variations("speeds", "CG speeds", 4, columns, caption, ERROR_WINDOW)
 
 
 def draw_masses(policies: Sequence[Policy], physics: str) -> Figure:
-    """Object masses: for each policy a column of known ones and one of changes in flight."""
+    """Flights with several object masses: per policy a column of known masses and one of changes in flight."""
     known, changed = (_fly(policies, scenarios, physics) for scenarios in (MASSES, CHANGES))
     columns = [pair for both in zip(known, changed, strict=True) for pair in both]
     titles = ("known mass", "mass changes")
     columns = [(f"{name}, {titles[k % 2]}", results) for k, (name, results) in enumerate(columns)]
     caption = (
         "Position of O, goal dotted, and its distance from there: CG ±0.05 m at 0.31 rad/s. Known: the hover thrust "
-        "assumes the true mass. Changes: mass added to or dropped from 0.2 kg in flight without telling the drones; "
+        "assumes the true mass. Changes: mass added to or dropped from 0.2 kg in flight, unknown to the drones; "
         "the leader has no integral term."
     )
     return _variations("masses", "Object masses", 5, columns, caption)
@@ -196,7 +196,7 @@ def _fly(followers: Sequence[Any], scenarios: Mapping[str, Scenario], physics: s
 def _variations(
     name: str, title: str, number: int, columns: Sequence[Column], caption: str, ahead: float = 0.0
 ) -> Figure:
-    """x, y, z and error of each column's flights; two columns beside each other, the next ones below."""
+    """x, y, z and error of each column's flights; two columns side by side, further ones below."""
     across = min(2, len(columns))
     figure, axes = panels([0.9, 0.9, 0.9, 1.4] * -(-len(columns) // across), across)
     looks, rows = series_styles(list(dict.fromkeys(label for _, flown in columns for label, _ in flown))), []
@@ -237,22 +237,22 @@ def _final(result: Result) -> str:
 def _draw_flights(
     axes: Sequence[Any], results: Sequence[Result], styles: Sequence[dict[str, Any]], ahead: float = 0.0
 ) -> None:
-    """x, y, z of O over time into three panels, the goal dotted; its distance from there into a fourth."""
+    """Plot x, y, z of O with the goal dotted into three panels, and its distance from the goal into a fourth."""
     for k, axis in enumerate(axes[:3]):
         first = results[0].flight
         axis.plot(first.time, first.target[:, k], color=INK, linestyle=":", linewidth=1)
         axis.set_ylabel(f"{'xyz'[k]} [m]")
     for result, look in zip(results, styles, strict=True):
         rows = thinned(len(result.flight.time))
-        values = *result.flight.position.T, _following(distance(result.flight), result.flight.time, ahead)
+        values = *result.flight.position.T, _largest_ahead(distance(result.flight), result.flight.time, ahead)
         for axis, value in zip(axes, values, strict=True):
             axis.plot(result.flight.time[rows], value[rows], **look)
     logarithmic(axes[3])
     axes[3].set_ylabel("error [mm]")
 
 
-def _following(error: np.ndarray, time: np.ndarray, ahead: float) -> np.ndarray:
-    """(T,) the largest of `error` (T,) in the `ahead` [s] from each moment on: no dips where it passes 0."""
+def _largest_ahead(error: np.ndarray, time: np.ndarray, ahead: float) -> np.ndarray:
+    """(T,) the largest `error` (T,) within the next `ahead` [s] of each time, which hides dips where it passes 0."""
     count = max(round(ahead / (time[1] - time[0])), 1)
     longer = np.concatenate([error, np.full(count - 1, error[-1])])
     return np.lib.stride_tricks.sliding_window_view(longer, count).max(axis=1)

@@ -1,4 +1,4 @@
-"""Figures of single flights."""
+"""Figures of flights over time."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from mjxball.plotting import (
 )
 from mjxball.sim.rollout import Trajectory
 
-PAPER_POINTS = 700  # of a curve of the paper's figures
-LEAST_SPAN = 0.01  # of an axis [m], [deg], [m/s2]
-LEAST_ERROR = 1e-3  # of the axis of distances: less is rounding [mm]
+PAPER_POINTS = 700  # points per curve in the paper's figures
+LEAST_SPAN = 0.01  # smallest range of an axis [m], [deg], [m/s2]
+LEAST_ERROR = 1e-3  # lower end of the axis of distances: less is rounding [mm]
 PANELS = (
     ("position", 0, "x [m]"),
     ("position", 1, "y [m]"),
@@ -42,22 +42,22 @@ CG_STYLES = ("-", ":")  # along the line, or along x and y
 
 
 def of_followers(flight: Trajectory, index: int) -> np.ndarray:
-    """(F, T) number `index` of every follower's command."""
+    """(F, T) component `index` of every follower's command."""
     return flight.follower_command.reshape(len(flight.time), -1, 3)[..., index].T
 
 
 def distance(flight: Trajectory) -> np.ndarray:
-    """(T,) of O from its goal, for a logarithmic axis [mm]."""
+    """(T,) distance of O from its goal [mm], with a lower bound for logarithmic axes."""
     return np.maximum(1e3 * np.linalg.norm(flight.position - flight.target, axis=-1), LEAST_ERROR)
 
 
 def draw_flights(
     results: Sequence[Result], title: str, path: Path, panels: Sequence[tuple[str, int | None, str]] = PANELS
 ) -> None:
-    """Draw all followers of one scenario over time, one of `PANELS` below the other.
+    """Plot the flights of all followers in one scenario over time, one panel of `PANELS` below the other.
 
-    Position with the goal dotted, distance, CG offset (y dotted), or commands, the leader's thin. A panel or a curve
-    without a finite number is left out.
+    Position with the goal dotted, distance, CG offset (y dotted), commands (the leader's thin). A panel or curve
+    without a finite value is left out.
     """
     plt = pyplot()
     panels = [panel for panel in panels if any(_is_known(_values(one.flight, *panel[:2])) for one in results)]
@@ -79,7 +79,7 @@ def _is_known(values: np.ndarray) -> bool:
 
 
 def _values(flight: Trajectory, kind: str, index: int | None) -> np.ndarray:
-    """(curves, T) what a panel shows of `flight`; of commands the leader's is the last."""
+    """Curves (n, T) of one panel for `flight`; among commands the leader's is last."""
     if kind == "position":
         return flight.position[None, :, index]
     if kind == "error":
@@ -130,7 +130,7 @@ def _draw_panel(
 
 
 def write_results(results: Sequence[Result], out: Path, look: str = "screen") -> None:
-    """Write `cells.json` and a PNG, or PDF of the style `paper`, for each scenario into `out`, which is made."""
+    """Write `cells.json` and, for each scenario, a PNG (PDF in the style `paper`) into `out`, which is created."""
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / RESULTS, to_json(results))
     with style(look):
@@ -142,11 +142,11 @@ def write_results(results: Sequence[Result], out: Path, look: str = "screen") ->
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure: its drawing, a caption, and a table of numbers computed from the curves."""
+    """One figure with its caption and a table of values computed from its curves."""
 
     name: str
     title: str
-    number: int  # of the paper's figure
+    number: int  # in the paper
     picture: bytes  # a file of the style's format
     caption: str
     heads: tuple[str, ...]
@@ -154,7 +154,7 @@ class Figure:
 
 
 def panels(heights: Sequence[float], columns: int = 1, sharex: bool = True) -> tuple[Any, np.ndarray]:
-    """A figure of the style's width with panels (rows, columns) of `heights` [in for a width of 4.5 in] over time."""
+    """A figure of the style's width with panels (rows, columns) of `heights` [in], for a width of 4.5 in, over time."""
     plt = pyplot()
     width = plt.rcParams["figure.figsize"][0]
     figure, axes = plt.subplots(
@@ -173,5 +173,5 @@ def panels(heights: Sequence[float], columns: int = 1, sharex: bool = True) -> t
 
 
 def thinned(count: int) -> np.ndarray:
-    """Rows of a curve of `count` that are drawn."""
+    """Indices of the plotted points of a curve of `count` points."""
     return np.unique(np.linspace(0, count - 1, PAPER_POINTS).astype(int))

@@ -1,6 +1,6 @@
-"""Flights side by side as one moving picture, rendered by MuJoCo.
+"""Flights side by side as one animation, rendered by MuJoCo.
 
-Rendering runs in a child process: a broken GL library may abort the interpreter.
+Rendering runs in a child process, because a broken GL library may abort the interpreter.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from mjxball.errors import InputError
 from mjxball.reading import parse_json
 from mjxball.sim.rollout import Trajectory
 
-TIME_LIMIT = 240  # [s] for a picture of a report
-TRAIL = 3.0  # [s] of the path that is drawn
+TIME_LIMIT = 240  # for a report's animation [s]
+TRAIL = 3.0  # length of the path that is drawn [s]
 TEXT = (29, 35, 41)
 
 
 class Kind(NamedTuple):
-    """A kind of file, by its suffix."""
+    """Settings of one file type."""
 
-    rate: float  # frames per second of playing time; of a GIF, whose clock ticks 10 ms, 100 over an integer
+    rate: float  # frames per second of playing time; for a GIF, with its 10 ms clock, 100 over an integer
     panel: tuple[int, int]  # height, width of one flight [pixels]
-    most: int  # frames: beyond it there is no file that anybody would show
+    most: int  # largest number of frames
 
 
 KINDS = {
@@ -49,7 +49,7 @@ PANEL = KINDS[".webp"].panel
 def film(
     plant: Plant, flights: Mapping[str, Trajectory], seconds: float, start: float = 0.0, speed: float = 2.0
 ) -> tuple[bytes | None, str]:
-    """(animated WebP, "") or (None, reason); `flights` by label, from `start` for `seconds` of flight time.
+    """Render `flights`, by label, from `start` for `seconds` of flight time: (animated WebP, "") or (None, reason).
 
     `speed` is flight time over playing time.
     """
@@ -78,10 +78,10 @@ def render(
     speed: float = 1.0,
     limit: float | None = None,
 ) -> bytes:
-    """The file of kind `suffix` that shows `flights`, arrays of a `Trajectory` by label, each on its plant of `plants`.
+    """Contents of a file of type `suffix` that shows `flights` (arrays of a `Trajectory` by label) on `plants`.
 
-    From `start` for `seconds` of flight time, None for all of it; who has ended stays where it was. `limit` is the time
-    that it may take [s]. Raises InputError if it cannot be made.
+    From `start` for `seconds` of flight time, None: to the end; a flight that has ended keeps its last state. `limit`
+    is the time limit of rendering [s]. Raises InputError if it fails.
     """
     kind = KINDS[suffix]
     last = max(float(flight["time"][-1]) for flight in flights.values())
@@ -116,7 +116,7 @@ def render(
 
 
 def _coder() -> str:
-    """The program ffmpeg: the one on PATH, or imageio-ffmpeg's."""
+    """Path of ffmpeg: the one on PATH, or imageio-ffmpeg's."""
     if found := shutil.which("ffmpeg"):
         return found
     try:
@@ -130,7 +130,7 @@ def _coder() -> str:
 
 
 def _arrays(flights: Sequence[Mapping[str, np.ndarray]], times: np.ndarray) -> dict[str, Any]:
-    """Rows of `flights` at `times` (n,), as `frames` takes them."""
+    """States of `flights` at `times` (n,) in the arrays that `frames` takes."""
     rows = [np.clip(np.searchsorted(flight["time"], times - 1e-9), 0, len(flight["time"]) - 1) for flight in flights]
 
     def stacked(name: str) -> np.ndarray:
@@ -149,10 +149,10 @@ def _arrays(flights: Sequence[Mapping[str, np.ndarray]], times: np.ndarray) -> d
 def frames(
     plants: Sequence[Plant], labels: Sequence[str], arrays: Mapping[str, Any], panel: tuple[int, int] = PANEL
 ) -> Iterator[Any]:
-    """One PIL image for each of `arrays`' times (n,): the flights side by side, labelled, with |e_o| and time.
+    """Yield one PIL image for each time (n,) of `arrays`: the flights side by side with label, |e_o| and time.
 
-    The other arrays (flights, n, ...) are "position", "quaternion", "goal", and "offset" with two numbers, of which the
-    second counts in a plane.
+    The other arrays (flights, n, ...) are "position", "quaternion", "goal", and "offset" with two components, of which
+    the second counts in a plane only.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -188,13 +188,13 @@ def frames(
 
 
 def _framing(plants: Sequence[Plant], position: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
-    """(what the camera looks at (3,), its distance [m]) so that all of the flights are seen."""
+    """(point that the camera looks at (3,), its distance [m]) such that all flights are visible."""
     points = np.concatenate([position.reshape(-1, 3), goal.reshape(-1, 3)])
     centre = np.median(goal.reshape(-1, 3), axis=0)
-    points = points[np.abs(points - centre).max(axis=-1) < 3.0]  # a flight that failed leaves the picture
+    points = points[np.abs(points - centre).max(axis=-1) < 3.0]  # ignore parts of failed flights
     low, high = points.min(axis=0), points.max(axis=0)
     arms = max(float(np.linalg.norm(drone.mount)) + 1.6 * plant.arm for plant in plants for drone in plant.drones)
-    radius = 1.08 * (np.linalg.norm(high - low) / 2 + arms)  # what comes nearer to the camera looks larger
+    radius = 1.08 * (np.linalg.norm(high - low) / 2 + arms)  # parts nearer to the camera look larger
     return (low + high) / 2, float(radius / np.tan(np.radians(22.5)))
 
 
@@ -215,7 +215,7 @@ def _render(folder: Path) -> None:
 
 
 def _write_gif(out: Path, pictures: Iterator[Any], rate: float) -> None:
-    """One palette, without dither: what stands still is stored once."""
+    """One palette without dither, so that static parts are stored once."""
     from PIL import Image
 
     first = next(pictures).quantize(128, dither=Image.Dither.NONE)

@@ -1,4 +1,4 @@
-"""Scenarios of the evaluation: the reference, the standard list, cross products, and waveforms from files."""
+"""Scenarios of the evaluation: the reference, the standard list, cross products, waveforms from files."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ STANDARD = (
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.62, 1.0, 2.0, 3.1)),
 )
 MOST_SAMPLES = 100_000
-SLOWEST = 60.0  # [s] between two samples of a waveform, as a rule
+LONGEST_STEP = 60.0  # longest usual time between two samples of a waveform [s]
 
 
 def cross(
     omegas: Sequence[float], amplitudes: Sequence[float], masses: Sequence[float], **common: Any
 ) -> tuple[Scenario, ...]:
-    """Full cross product of the lists, in the given order."""
+    """All combinations of CG speeds [rad/s], amplitudes [m] and masses [kg], in the given order."""
     cells = itertools.product(omegas, amplitudes, masses)
     return tuple(Scenario(omega=w, amplitude=a, mass=m, **common) for w, a, m in cells)
 
 
 def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
-    """The standard scenarios as far as the plant allows them, the reference one first; raise InputError if unsound.
+    """The standard scenarios, adapted to the plant, with the reference first; raises InputError if one is invalid.
 
-    Load and goal are the plant's (`of_plant`); the reference's CG is as fast as training may draw. A waveform or a
-    rolling ball makes one scenario. In the plane the CG goes round in a circle.
+    Load and goal are the plant's (`of_plant`); the reference's CG speed is clipped to the training range. A waveform or
+    a rolling ball gives one scenario. In the plane the CG moves in a circle.
     """
     plant, path = settings.plant, CIRCLE if len(settings.plant.directions) == 2 else REFERENCE.path
     start = min(settings.scenario.ball_start, ball_limit(plant))
@@ -55,7 +55,7 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
 
 
 def rig_line(settings: Config, mass: float | None = None) -> str:
-    """What a user should see of a rig before its results, with an object of `mass` [kg], None: the reference's."""
+    """Summary of a rig for the user, with an object of `mass` [kg]; None: the reference's mass."""
     plant, margin = settings.plant, settings.scenario.trim_margin
     reference = of_plant(settings, Scenario())
     mass = reference.mass if mass is None else mass
@@ -73,8 +73,8 @@ def rig_line(settings: Config, mass: float | None = None) -> str:
 def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Times [s] and offsets [m] from a CSV file with two columns; a header line is allowed.
 
-    Raises InputError if the file cannot be read or its times do not increase; the range is checked with the
-    configuration. stderr says where samples are missing and the motion is a guess.
+    Raises InputError if the file cannot be read or its times do not increase; offsets are checked with the
+    configuration. Gaps between samples, where the motion is interpolated, are reported on stderr.
     """
     try:
         lines = [line for line in csv.reader(read_text(path, "waveform").splitlines()) if line]
@@ -96,7 +96,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     times, offsets = zip(*samples, strict=True)
     if len(times) > 1:
         try:
-            for remark in check_times(times, longest=SLOWEST):
+            for remark in check_times(times, longest=LONGEST_STEP):
                 warn(f"waveform {path}: {remark}; the CG moves on a spline there")
         except ValueError as error:
             raise InputError(f"waveform {path}: {error}, a header not counted") from None

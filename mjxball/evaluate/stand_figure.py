@@ -1,4 +1,4 @@
-"""The paper's experiment on the test stand (Fig. 7) in simulation, beside a leader with better settings."""
+"""The paper's experiment on the test stand (Fig. 7) in simulation, and the same with better settings of the leader."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from mjxball.sim.rollout import Trajectory, check_rate, simulate_batch
 from mjxball.sim.scenario import Scenario
 
 SETTINGS = {"paper": "the paper's gains", "better": "better settings"}
-# The leader's height loop of free flight with a quarter of its integral, and thrust by the motors' curve.
+# The leader's gains of free flight with a quarter of the height integral, and thrust by the motors' curve.
 BETTER = {
     "leader.kp": (1.0, 1.0, 4.0),
     "leader.kd": (2.0, 2.0, 3.5),
     "leader.ki": (0.2, 0.1, 0.5),
     "autopilot.thrust_law": "calibrated",
 }
-LEVEL = 0.08  # height of the leader at rest on the level stand, its goal p_l^d (paper) [m]
-# Slightly off (ours): 3 degrees of roll, 3 cm too low, the ball 3 cm from the middle and at rest.
+LEVEL = 0.08  # height of the leader on the level stand, its goal p_l^d (paper) [m]
+# Small initial errors (ours): 3 degrees of roll, 3 cm too low, the ball at rest 3 cm from the middle.
 STAND_START = Scenario(
     amplitude=0.0,
     mass=configs.preset("stand").plant.object_mass,
@@ -45,7 +45,7 @@ class StandFlight:
     """A flight on the stand, one row per control step."""
 
     time: np.ndarray  # (T,) [s]
-    height: np.ndarray  # (T,) of the leader, `LEVEL` where the stick is level and O at its goal [m]
+    height: np.ndarray  # (T,) of the leader; `LEVEL` if the stick is level and O at its goal [m]
     roll: np.ndarray  # (T,) of the assembly [rad]
     vertical: np.ndarray  # (T,) follower's vertical acceleration command [m/s2]
     ball: np.ndarray  # (T,) from O along the stick, towards the leader [m]
@@ -57,22 +57,22 @@ class StandFlight:
 
     @property
     def roll_rms(self) -> float:
-        """Root mean square of the roll after 20 s [deg]."""
+        """Root mean square of the roll from 20 s on [deg]."""
         return float(np.degrees(np.sqrt(np.mean(self.roll[self.steady] ** 2))))
 
     @property
     def ball_range(self) -> float:
-        """Distance between the ball's outermost positions after 20 s [m]."""
+        """Range of the ball's position from 20 s on [m]."""
         return float(np.ptp(self.ball[self.steady]))
 
     @property
     def height_peak(self) -> float:
-        """Largest height error of the leader after 20 s [m]."""
+        """Largest height error of the leader from 20 s on [m]."""
         return float(np.abs(self.height[self.steady] - LEVEL).max())
 
 
 def stand_config(settings: str = "paper") -> Config:
-    """The preset `stand`, with the paper's settings of the leader or `better` ones."""
+    """The preset `stand` with the `paper` settings of the leader or the `better` ones."""
     config = configs.preset("stand")
     for name, value in BETTER.items() if settings == "better" else ():
         config = configs.replace(config, name, value)
@@ -82,9 +82,9 @@ def stand_config(settings: str = "paper") -> Config:
 def fly_stand(
     config: Config, followers: Sequence[Follower], leader_error: bool, physics: str, scenario: Scenario
 ) -> list[StandFlight]:
-    """Fly each of `followers` on the stand; it sees O's error or, with `leader_error`, the leader's, as in the paper.
+    """Fly `followers` on the stand; they observe the error of O, or the leader's with `leader_error` (paper).
 
-    The leader's law is eq. 5 on e_l = p_l^d - p_l, p_l^d its position when the stick is level and O at its goal.
+    The leader's controller is eq. 5 on e_l = p_l^d - p_l; p_l^d is its position with the stick level and O at its goal.
     """
     config = configs.replace(config, "follower.error", "leader" if leader_error else "object")
     for follower in followers:
@@ -102,7 +102,7 @@ def _stand_flight(config: Config, flown: Trajectory) -> StandFlight:
 
 
 def draw_stand(policies: Sequence[Policy], physics: str) -> Figure:
-    """Classical followers and the policies made for the stand, with both settings of the leader."""
+    """Classical followers and the policies for the stand, with both settings of the leader."""
     flown: dict[str, dict[str, StandFlight]] = {}
     for settings in SETTINGS:
         config = stand_config(settings)

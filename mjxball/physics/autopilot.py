@@ -1,4 +1,4 @@
-"""What flies each drone: the ideal attitude loop, or a Crazyflie's firmware with its motors and battery."""
+"""Low-level control of each drone: the ideal attitude loop, or a Crazyflie's firmware with its motors and battery."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ Autopilot = Callable[[PlantState, Array, Load], tuple[Any, Array]]
 
 def rotor_targets(
     config: Config,
-    numbers: PlantParameters,
+    parameters: PlantParameters,
     state: PlantState,
     commands: Float[Array, "... drones 3"],
     believed_mass: Scalar,
 ) -> Float[Array, "... drones 4"]:
-    """Rotor forces [N] that all attitude loops ask for at `commands`."""
+    """Rotor forces [N] that all ideal attitude loops ask for at `commands` (roll, pitch, vertical acceleration)."""
     euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
     return attitude.rotor_commands(
         commands,
         euler[..., None, :],
         state.rates[..., None, :],
-        carried_mass(numbers, state, believed_mass),
-        numbers.gains,
-        numbers.gravity,
-        numbers.arm,
-        numbers.yaw_per_thrust,
-        numbers.rotor_force_max,
+        carried_mass(parameters, state, believed_mass),
+        parameters.gains,
+        parameters.gravity,
+        parameters.arm,
+        parameters.yaw_per_thrust,
+        parameters.rotor_force_max,
         config.plant.layout,
-        numbers.yaw,
+        parameters.yaw,
     )
 
 
-def carried_mass(numbers: PlantParameters, state: PlantState, believed_mass: Scalar) -> Float[Array, "... drones"]:
-    """Mass that every drone believes to lift: itself, its share of the carrier and that of the object [kg]."""
+def carried_mass(parameters: PlantParameters, state: PlantState, believed_mass: Scalar) -> Float[Array, "... drones"]:
+    """Mass that each drone's hover thrust assumes: itself and its shares of the carrier and of the object [kg]."""
     xp, dtype = state.rates.__array_namespace__(), state.rates.dtype
-    own, share = (xp.asarray(value, dtype=dtype) for value in (numbers.known_mass, numbers.load_share))
+    own, share = (xp.asarray(value, dtype=dtype) for value in (parameters.known_mass, parameters.load_share))
     return own + share * believed_mass[..., None]
 
 
@@ -69,33 +69,31 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
             return with_battery(state, commands, load)
         if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
             # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
-            usual = commands[..., 0, 0] * 0.0
-            return with_battery(
-                state, commands, load._replace(battery=usual + motors.USUAL_BATTERY, uncompensated=usual)
-            )
-        xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
-        sent = crazyflie.setpoints(law, commands, carried_mass(constants, state, load.believed_mass), gravity)
+            zero = commands[..., 0, 0] * 0.0
+            return with_battery(state, commands, load._replace(battery=zero + motors.USUAL_BATTERY, uncompensated=zero))
+        xp, autopilot, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
+        sent = crazyflie.setpoints(autopilot, commands, carried_mass(constants, state, load.believed_mass), gravity)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype, config.plant.count, config.plant.leader)
-        loops, duty = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
-        return loops, crazyflie.motor_force(law.motor_curve, duty)
+        integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
+        loops, duty = crazyflie.cascade(autopilot, state.loops, sent, euler, rates, integrals)
+        return loops, crazyflie.motor_force(autopilot.motor_curve, duty)
 
     return firmware
 
 
 def make_battery_autopilot(config: Config, parameters: PlantParameters | None = None) -> Autopilot:
-    """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
+    """The firmware's loops with motors that follow the battery voltage `load.battery`, with or without compensation.
 
-    Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
-    (`motors.with_curve`), as the runner does.
+    Where `load.uncompensated` is 1, setpoints and gains are converted for the uncompensated motor curve
+    (`motors.with_curve`), as the flight program does.
     """
     constants = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    law, gravity = config.autopilot, config.plant.gravity
-    motor = motors.MOTORS[law.drone or "2.1"]
-    uncompensated_law = motors.with_curve(config, motors.OLDER).autopilot
-    slower = uncompensated_law.roll_rate[0] / law.roll_rate[0]
-    line = motors.compensates(law.motor_curve)
+    autopilot, gravity = config.autopilot, config.plant.gravity
+    motor = motors.MOTORS[autopilot.drone or "2.1"]
+    older = motors.with_curve(config, motors.OLDER).autopilot
+    slower = older.roll_rate[0] / autopilot.roll_rate[0]
+    line = motors.compensates(autopilot.motor_curve)
 
     def with_battery(
         state: PlantState, commands: Float[Array, "... drones 3"], load: Load
@@ -107,18 +105,18 @@ def make_battery_autopilot(config: Config, parameters: PlantParameters | None = 
         old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]
         sent = xp.where(
             old,
-            crazyflie.setpoints(uncompensated_law, commands, carried, gravity),
-            crazyflie.setpoints(law, commands, carried, gravity),
+            crazyflie.setpoints(older, commands, carried, gravity),
+            crazyflie.setpoints(autopilot, commands, carried, gravity),
         )
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype, config.plant.count, config.plant.leader)
+        integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
 
         def duty(command: Array) -> Array:
             return xp.where(old, command, motors.compensated(motor, command, battery)) if line else command
 
-        loops, pwm = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals, duty, rate_share)
+        loops, pwm = crazyflie.cascade(autopilot, state.loops, sent, euler, rates, integrals, duty, rate_share)
         return loops, motors.force(motor, pwm, battery)
 
     return with_battery

@@ -1,4 +1,4 @@
-"""What every physics engine shares: the plant's state, wrenches, contact forces, and the accelerations it provides."""
+"""Types and functions that all physics engines share: the plant's state, wrenches, contact forces, accelerations."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
     Scalar = Float[Array, "..."]
-    # Of the load along its directions: (...) on a line, (..., 2) in a plane.
+    # Coordinates of the load along its directions: (...) on a line, (..., 2) in a plane.
     Coordinates = Float[Array, "..."]
     Vector = Float[Array, "... 3"]
-# A flight beyond one of these has diverged: the physics no longer holds, and no flight came back from there.
+# Limits beyond which a flight counts as diverged.
 MAX_POSITION, MAX_RATE = 1e3, 50.0  # [m] each coordinate, [rad/s] norm
 UPWARDS = np.array([0.0, 0.0, 1.0], np.float32)  # e3
 
 
 class PlantState(NamedTuple):
-    """State of the rigid assembly, its rotors and a rolling ball, any leading batch shape."""
+    """State of the rigid assembly, its rotors and a rolling ball, with any leading batch shape."""
 
     position: Vector  # of O in the world [m]
     quaternion: Float[Array, "... 4"]  # body -> world, (w, x, y, z)
     velocity: Vector  # of O in the world [m/s]
     rates: Vector  # angular velocity in body axes [rad/s]
     rotor_force: Float[Array, "... drones 4"]  # [N]
-    ticks: Int[Array, "..."]  # halves of a physics step since the start of the episode
-    time: Scalar  # their number times their length [s]: a sum of them in float32 is 2 s off after half an hour
+    ticks: Int[Array, "..."]  # half physics steps since the start of the episode
+    time: Scalar  # ticks times their length [s]: summing in float32 is 2 s off after half an hour
     ball_offset: Coordinates  # of a rolling ball from O [m]; unused by prescribed motions
     ball_rate: Coordinates  # [m/s]
     loops: Float[Array, "... drones 13"] | None = None  # of a Crazyflie, see `control.crazyflie`; None: ideal
 
     def each(self, function: Callable[..., Any], *others: PlantState) -> PlantState:
-        """`function` of every leaf that there is, and of the same leaf of `others`."""
+        """Apply `function` to every leaf that is not None, with the same leaves of `others`."""
         rows = zip(self, *others, strict=True)
         return PlantState(*(None if row[0] is None else function(*row) for row in rows))
 
 
 class CgState(NamedTuple):
-    """Coordinates of the CG from O along the load's directions, with consistent derivatives."""
+    """Coordinates of the CG from O along the load's directions, and their time derivatives."""
 
     offset: Coordinates  # [m]
     rate: Coordinates  # [m/s]
@@ -55,12 +55,12 @@ class CgState(NamedTuple):
 
 
 def coordinates(value: Coordinates, directions: int) -> list[Scalar]:
-    """The load's coordinates one by one: `value` itself on a line, else its last axis."""
+    """Split the load's coordinates: `[value]` on a line, else the components of the last axis."""
     return [value] if directions == 1 else [value[..., number] for number in range(directions)]
 
 
 def joined(values: Sequence[Scalar]) -> Coordinates:
-    """The inverse of `coordinates`."""
+    """The inverse of `coordinates`: one coordinate as it is, two along the last axis."""
     return values[0] if len(values) == 1 else arrays.joined(values)
 
 
@@ -74,7 +74,7 @@ def solve_small(matrix: Any, vector: Any) -> list[Scalar]:
 
 
 class PathShape(NamedTuple):
-    """How the CG's path in a plane differs from a sine along x: (A sin a, width A sin(ratio a + lead)), turned."""
+    """Shape of the CG's path in a plane, in axes turned by `direction`: (A sin a, width A sin(ratio a + lead))."""
 
     direction: Scalar  # of the first of both sines from body x [rad]
     width: Scalar  # amplitude of the second over that of the first; 0: a line, 1 with a lead of pi / 2: a circle
@@ -83,7 +83,7 @@ class PathShape(NamedTuple):
 
 
 class Load(NamedTuple):
-    """The object's mass and the motion of its centre of gravity."""
+    """The object's mass and the motion of its centre of gravity, and disturbances of the flight."""
 
     object_mass: Scalar  # true mass at the start [kg]
     believed_mass: Scalar  # mass that the hover thrust assumes [kg]
@@ -96,19 +96,18 @@ class Load(NamedTuple):
     rotor_lag_scale: Scalar | None = None  # factor on the rotors' time constant; None: 1
     thrust_scale: Float[Array, "... drones"] | None = None  # factor on each drone's rotor forces; None: 1
     added_inertia: Vector | None = None  # about the body axes through O, without mass [kg m2]; None: none
-    # Places in units of the amplitude, (..., places) or (..., places, 2), see `motion.waypoints`; None: the CG follows
-    # the sine.
+    # Waypoints in units of the amplitude, (..., places) or (..., places, 2), see `motion.waypoints`; None: a sine.
     cg_path: Float[Array, "... places"] | None = None
-    follows_path: Scalar | None = None  # 1 where it does, 0 where it follows the sine
+    follows_path: Scalar | None = None  # 1 where the CG follows `cg_path`, 0 where it follows the sine
     battery: Scalar | None = None  # voltage of all batteries [V]; None: motors follow the curve
     uncompensated: Scalar | None = None  # 1 where the firmware does not compensate for the battery, else 0
     cg_shape: PathShape | None = None  # of the path in a plane; None: a sine along x
-    stop_time: Float[Array, "... drones"] | None = None  # when each drone's rotors are let stop [s]; None: never
+    stop_time: Float[Array, "... drones"] | None = None  # when each drone's rotors stop [s]; None: never
     thrust_fade: Scalar | None = None  # share of all rotor forces that is lost in a second [1/s]; None: none
 
 
 class Wrench(NamedTuple):
-    """All rotors' wrench on the assembly about O, body axes."""
+    """Wrench of all rotors on the assembly about O, body axes."""
 
     force: Vector  # [N]
     torque: Vector  # [N m]
@@ -146,11 +145,12 @@ def total_wrench(plant: Plant, parameters: PlantParameters, rotor_force: Float[A
 def contact_wrenches(
     plant: Plant, parameters: PlantParameters, state: PlantState, linear: Vector, angular: Vector
 ) -> tuple[Float[Array, "... drones 3"], Float[Array, "... drones 3"]]:
-    """Contact forces [N] and torques [N m] of every drone on the carrier, body axes.
+    """Contact forces [N] and torques [N m] of every drone on the carrier, body axes, about each drone's own centre.
 
-    `linear` is the acceleration of O in the world, `angular` in body axes:
-    F_i = T_i e3 - m_i g R^T E3 - m_i a_i, a_i = a_b + w' x r_i + w x (w x r_i),
-    tau_i = tau_rotor,i - w x I_i w - I_i w', torques about each drone's own centre.
+    `linear` is the acceleration of O in the world [m/s2], `angular` the angular acceleration in body axes [rad/s2]:
+
+        F_i = T_i e3 - m_i g R^T E3 - m_i a_i,  a_i = a_b + w' x r_i + w x (w x r_i)
+        tau_i = tau_rotor,i - w x I_i w - I_i w'
     """
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     held = parameters.gravity * matrix[..., 2, :] + rotations.rotate_back(matrix, linear)
@@ -164,7 +164,7 @@ def contact_wrenches(
 
 
 def has_diverged(plant: PlantState) -> Bool[Array, "..."]:
-    """(...) true where a value of `plant` is not finite, or position or rates are beyond what the physics is for."""
+    """(...) true where a value of `plant` is not finite, or position or rates exceed `MAX_POSITION` or `MAX_RATE`."""
     xp, batch = plant.position.__array_namespace__(), plant.position.ndim - 1
     with np.errstate(invalid="ignore", over="ignore"):
         far = (xp.abs(plant.position) > MAX_POSITION).any(axis=-1)

@@ -1,4 +1,4 @@
-"""Accelerations of the assembly from MuJoCo MJX: the ball's slide joint is driven or rolls, its reaction acts."""
+"""Accelerations of the assembly from MuJoCo MJX, with the ball on slide joints that are driven or roll freely."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 
 
 def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | None = None) -> Engine:
-    """Return the MJX engine of `plant` for one world; use `jax.vmap` for many.
+    """Return the MJX engine of `plant` for one environment; use `jax.vmap` for many.
 
-    `parameters`: its numbers, if they are not those of `plant`; traced ones may differ from world to world.
+    `parameters` replace those of `plant`; traced ones may differ from environment to environment.
 
-    MJX computes the mass matrix and the bias forces. With the ball's acceleration c'' prescribed, the root's
-    accelerations follow from their own rows, and the force that drives the slides (whose reaction moves the
-    assembly) never needs to be formed; a rolling ball adds its own rows. Dynamics do not depend on where the
-    assembly is or on its linear velocity, so both are zero here: that keeps float32 at its best.
+    MJX computes the mass matrix and the bias forces. If the ball's acceleration c'' is prescribed, the root's
+    accelerations follow from the root's rows, and the force that drives the slides need not be computed; a rolling ball
+    adds its rows. The dynamics do not depend on the assembly's position or linear velocity, so both are 0 here, which
+    keeps float32 as accurate as possible.
     """
     stages = _Stages(plant, plant_parameters(plant, attitude), parameters)
-    share = stages.numbers.moving_fraction
+    share = stages.parameters.moving_fraction
 
     def prescribed(
         state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
@@ -66,16 +66,16 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
 
 
 class _Stages:
-    """MJX's smooth dynamics of one plant, with the object's mass as an argument."""
+    """MJX's smooth dynamics of one plant with the object's mass as an argument."""
 
     def __init__(self, plant: Plant, nominal: PlantParameters, parameters: PlantParameters | None):
         self._mjx = import_mjx()
-        self.numbers = nominal if parameters is None else parameters
-        # Merging the welded bodies is exact and faster; a shell whose mass varies must stay a body of its own, and so
-        # must drones whose numbers are not those of the model.
+        self.parameters = nominal if parameters is None else parameters
+        # Merging the welded bodies is exact and faster. A shell of varying mass must stay a separate body, and so must
+        # drones whose parameters differ from the model's.
         self._fused = plant.moving_fraction == 1 and parameters is None
         model = build_model(plant, fuse=self._fused)
-        # MJX's own choice is the first device of all processes, which only the first process can reach.
+        # By default MJX takes the first device of all processes, which only the first process can reach.
         here = {"device": jax.local_devices()[0], "impl": "jax"}
         self._model, self._blank = self._mjx.put_model(model, **here), self._mjx.make_data(model, **here)
         self._assembly, self._ball = model.body(ASSEMBLY).id, model.body(BALL).id
@@ -91,7 +91,7 @@ class _Stages:
         rate: Float[Array, " slides"],
         added: Vector | None,
     ) -> tuple[Float[Array, "nv nv"], Float[Array, " nv"]]:
-        """Mass matrix and bias force, ball at `offset` moving at `rate`; inertia is `added`."""
+        """Mass matrix and bias force with the ball at `offset` [m] moving at `rate` [m/s]; `added` is inertia."""
         dtype = state.rates.dtype
         zero = jnp.zeros((), dtype)
         if self._stand == "free":
@@ -112,7 +112,7 @@ class _Stages:
     def _spun(
         self, state: PlantState, mass: Float[Array, "nv nv"], bias: Float[Array, " nv"], added: Vector
     ) -> tuple[Float[Array, "nv nv"], Float[Array, " nv"]]:
-        """With inertia about the body axes through O, without mass, on the root's rotation."""
+        """Add inertia `added` about the body axes through O, without mass, to the root's rotation."""
         n = self.root
         axes = slice(3, 6) if self._stand == "free" else slice(n - 1, n)
         gyration = rotations.cross(state.rates, added * state.rates)
@@ -121,7 +121,7 @@ class _Stages:
         return mass.at[axes, axes].add(jnp.diag(inertia)), bias.at[axes].add(gyration)
 
     def _loaded(self, object_mass: Scalar, dtype: Any) -> Any:
-        m, own = self._model, self.numbers
+        m, own = self._model, self.parameters
         mass, inertia, armature = (a.astype(dtype) for a in (m.body_mass, m.body_inertia, m.dof_armature))
         share = own.moving_fraction
         moving = object_mass * share
@@ -155,7 +155,7 @@ class _Stages:
         return jnp.concatenate([*heave, wrench.torque[:1]])
 
     def result(self, state: PlantState, solution: Float[Array, " root"]) -> tuple[Vector, Vector]:
-        """Accelerations of O in the world and about the body axes from the root's."""
+        """Acceleration of O in the world and angular acceleration in body axes from the root's accelerations."""
         if self._stand == "free":
             return solution[:3], solution[3:]
         zero = jnp.zeros((), solution.dtype)
@@ -164,9 +164,9 @@ class _Stages:
 
 
 def _mass_matrix(model: Any, data: Any) -> Float[Array, "nv nv"]:
-    """`mjx.full_m` of degrees of freedom in one chain, from MJX's composite inertias.
+    """The mass matrix of degrees of freedom in one chain, as `mjx.full_m`, from MJX's composite inertias.
 
-    As sums instead of a product of small matrices, one for each world, which takes XLA a third of the step on a CPU.
+    Written as sums: a small matrix product for each environment takes XLA a third of the step on a CPU.
     """
     composite, motion = data._impl.crb[np.asarray(model.dof_bodyid)], data.cdof
     (xx, yy, zz, xy, xz, yz), moment, mass = composite[:, :6].T, composite[:, 6:9], composite[:, 9:]
@@ -182,7 +182,7 @@ def _mass_matrix(model: Any, data: Any) -> Float[Array, "nv nv"]:
 
 
 def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:
-    """Solve M a = f for the root: 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
+    """Solve M a = f for a root of size 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
     if len(force) <= 2:
         return jnp.stack(solve_small(mass, force))
     total, coupling = mass[0, 0], mass[3:, :3]

@@ -1,4 +1,4 @@
-"""Motions of the object's centre of gravity: along a body axis, or in the carrier's plane."""
+"""Motions of the object's centre of gravity along a body axis or in the carrier's plane."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def sine(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar) -> CgSta
 def waypoints(
     time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, places: Float[Array, "... places"]
 ) -> CgState:
-    """The CG goes from place to place, `places` in units of the amplitude, again and again (ours).
+    """The CG moves from waypoint to waypoint, `places` in units of the amplitude, in a closed loop (ours).
 
-    Each way takes half of a sine's period, pi / Omega, along the quintic that starts and ends at rest: between the
-    ends of the object its speed and acceleration are at most 1.2 times that sine's.
+    Each segment takes half a period of the sine, pi / Omega, along the quintic that starts and ends at rest. Between
+    the ends of the object its speed and acceleration are at most 1.2 times that sine's.
     """
     xp = time.__array_namespace__()
     count = places.shape[-1]
@@ -59,7 +59,7 @@ def waypoints(
 
 
 def sine_or_waypoints(time: Scalar, load: Load) -> CgState:
-    """A flight's own motion: its sine, or random waypoints instead."""
+    """Motion of the CG on a line: the flight's sine, or its waypoints where `load.follows_path`."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = sine(time, *sines)
     if load.cg_path is None or load.follows_path is None:
@@ -81,7 +81,7 @@ def lissajous(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, sha
 
 
 def lissajous_or_waypoints(time: Scalar, load: Load) -> CgState:
-    """As `sine_or_waypoints` in the plane, where the CG goes straight from one place to the next."""
+    """As `sine_or_waypoints` in the plane; the CG moves in straight lines between waypoints."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = lissajous(time, *sines, load.cg_shape)
     if load.cg_path is None or load.follows_path is None:
@@ -117,7 +117,7 @@ def largest_offset(spline: Spline) -> float:
 
 
 def follow_spline(spline: Spline, time: Scalar) -> CgState:
-    """Offset, rate and acceleration of `spline` at `time`; before and after it the CG stands still."""
+    """Offset, rate and acceleration of `spline` at `time`; before and after its knots the CG stands still."""
     xp = time.__array_namespace__()
     knots, table = (xp.asarray(value, dtype=time.dtype) for value in spline)
     piece = xp.clip((time[..., None] >= knots[1:-1]).sum(axis=-1), 0, len(spline.times) - 2)
@@ -131,9 +131,9 @@ def follow_spline(spline: Spline, time: Scalar) -> CgState:
 
 
 def make_prescribed(config: Config) -> Prescribed:
-    """Return `prescribed(time, load)`, the CG's motion for the kinds sine and waveform.
+    """Return `prescribed(time, load)`, the motion of the CG of the kinds sine and waveform.
 
-    Raises InputError if a waveform's spline leaves the object between its samples.
+    Raises InputError if the spline of a waveform leaves the object between its samples.
     """
     in_plane, waves = len(config.plant.directions) == 2, config.motion
     if waves.kind == "sine":
@@ -157,7 +157,7 @@ def make_prescribed(config: Config) -> Prescribed:
 
 
 def _farthest(along: Spline, across: Spline) -> float:
-    """Largest distance from O [m] at 100 times between any two samples."""
+    """Largest distance from O [m], from 100 times between every two samples."""
     shares = np.linspace(0, 1, 100)
     time = (along.times[:-1, None] + np.diff(along.times)[:, None] * shares).ravel()
     return float(np.hypot(follow_spline(along, time).offset, follow_spline(across, time).offset).max())
@@ -166,14 +166,13 @@ def _farthest(along: Spline, across: Spline) -> float:
 def make_rolling_force(
     config: Config, parameters: PlantParameters | None = None
 ) -> Callable[[Coordinates, Coordinates, Scalar], Coordinates]:
-    """Return `force(offset, rate, ball_mass)` [N] along the load's directions: rolling friction, stops.
+    """Return `force(offset, rate, ball_mass)` [N] along the load's directions: rolling friction and end stops.
 
-    Friction is -mu m_b g tanh(v / creep). A stop is a one-sided spring and damper that never pulls; the
-    inertia against it is 7/5 m_b, that of a solid ball that rolls (ours). A plate's rim is round and acts along
-    the radius alone.
+    Friction is -mu m_b g tanh(v / creep). A stop is a one-sided spring and damper that never pulls; the inertia against
+    it is 7/5 m_b, that of a solid ball that rolls (ours). The rim of a plate is round and acts along the radius alone.
     """
-    numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    end, gravity = numbers.ball_limit, numbers.gravity
+    params = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
+    end, gravity = params.ball_limit, params.gravity
     directions = len(config.plant.directions)
     stiffness = 1.4 * STOP_FREQUENCY**2
     damping = 1.4 * 2 * STOP_DAMPING * STOP_FREQUENCY
@@ -203,6 +202,6 @@ def make_rolling_force(
 
 
 def object_mass(time: Scalar, load: Load) -> Scalar:
-    """The object's mass [kg] at `time`: a change is impulse-free, velocities carry over."""
+    """The object's mass [kg] at `time`; a change of mass leaves all velocities as they are."""
     due = time[..., None] >= load.mass_change_time
     return load.object_mass + (due * load.mass_change).sum(axis=-1)

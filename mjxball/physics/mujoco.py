@@ -1,4 +1,4 @@
-"""Accelerations and internal forces of the assembly from C MuJoCo on the unfused model: the second engine."""
+"""Accelerations and internal forces of the assembly from C MuJoCo, for models whose welded bodies are not merged."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 
 def make_engine(plant: Plant, attitude: Attitude) -> Engine:
-    """Return the C MuJoCo engine of `plant` on NumPy arrays of any batch shape, one world at a time.
+    """Return the C MuJoCo engine of `plant` on NumPy arrays of any batch shape; it computes one environment at a time.
 
-    For a prescribed motion the force on the slide that gives the ball its c'' is computed from MuJoCo's mass
-    matrix and applied; the accelerations are then MuJoCo's own.
+    For a prescribed motion the force on the slide that gives the ball its c'' is computed from MuJoCo's mass matrix and
+    applied. The accelerations are then MuJoCo's.
     """
     world = MujocoWorld(plant, attitude)
     share = plant.moving_fraction
@@ -66,7 +66,7 @@ def _refuse(added: Vector | None) -> None:
 
 
 def _each(arguments: Sequence[Any], shape: tuple[int, ...], function: Any) -> np.ndarray:
-    """Stack `function` of every world's slice of the (named tuples of) arrays in `arguments`."""
+    """Stack `function` of every environment's slice of the arrays (or named tuples of arrays) in `arguments`."""
 
     def pick(value: Any, index: tuple[int, ...]) -> Any:
         if isinstance(value, tuple):
@@ -78,19 +78,19 @@ def _each(arguments: Sequence[Any], shape: tuple[int, ...], function: Any) -> np
 
 
 class MujocoWorld:
-    """One MjModel and MjData of a plant, and the few operations that the engine and the contact wrenches need."""
+    """MjModel and MjData of one plant, and the operations that the engine and the contact wrenches need."""
 
     def __init__(self, plant: Plant, attitude: Attitude):
         self.model = build_model(plant)
         self.data = mujoco.MjData(self.model)
-        self._plant, self._numbers = plant, plant_parameters(plant, attitude)
+        self._plant, self._parameters = plant, plant_parameters(plant, attitude)
         self._shell, self._ball = self.model.body(ASSEMBLY).id, self.model.body(BALL).id
         self._drones = [self.model.body(name).id for name in drone_names(plant)]
         self._slides = slice(self.model.nv - len(plant.directions), self.model.nv)
 
     def place(self, state: PlantState, object_mass: float, offset: Array, rate: Array) -> None:
-        """Set mass, positions and velocities, and compute everything that depends on them; no force yet."""
-        model, data, share, own = self.model, self.data, self._plant.moving_fraction, self._numbers
+        """Set mass, positions and velocities, and compute what depends on them; all applied forces are 0 afterwards."""
+        model, data, share, own = self.model, self.data, self._plant.moving_fraction, self._parameters
         model.body_mass[self._shell] = object_mass * (1 - share) + own.carrier_mass
         model.body_mass[self._ball] = object_mass * share
         model.body_inertia[self._shell] = object_mass * own.shell_inertia_per_mass + own.carrier_inertia
@@ -117,12 +117,12 @@ class MujocoWorld:
         mujoco.mj_applyFT(self.model, self.data, force, torque, origin, self._shell, self.data.qfrc_applied)
 
     def drive(self, acceleration: Array) -> Float[np.ndarray, " n"]:
-        """Give the ball `acceleration` along its slides by the force that it takes; see `roll` for the result."""
+        """Accelerate the ball by `acceleration` along its slides and return what `roll` returns."""
         pushed = self.data.qfrc_applied + self._external() - self.data.qfrc_bias
         return self.roll(slide_force(self.model, self.data, self._slides, acceleration, pushed))
 
     def roll(self, force: Array) -> Float[np.ndarray, " n"]:
-        """Accelerations: O in the world, angular in body axes, ball (one or two); with `force` on the slides [N]."""
+        """Accelerations (n,): O in the world, angular in body axes, ball; with `force` on the slides [N]."""
         model, data = self.model, self.data
         data.qfrc_applied[self._slides] += force
         mujoco.mj_fwdActuation(model, data)
@@ -136,18 +136,18 @@ class MujocoWorld:
         return np.array([0.0, 0.0, rise, roll, 0.0, 0.0, *a[self._slides]])
 
     def load_drones(self, state: PlantState, rotor_force: Float[Array, "drones 4"]) -> None:
-        """Apply each drone's rotor wrench to its own body, so that the welds carry it to the object."""
+        """Apply each drone's rotor wrench to the drone's body, so that the welds carry it to the object."""
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        wrenches = rotor_wrenches(self._plant, self._numbers, rotor_force)
+        wrenches = rotor_wrenches(self._plant, self._parameters, rotor_force)
         for body, wrench in zip(self._drones, wrenches, strict=True):
             self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
             self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]
 
     def contact_wrenches(self, state: PlantState) -> Float[np.ndarray, "2 drones 3"]:
-        """Forces, then torques that the drones exert on the carrier, body axes, at their centres.
+        """Forces and torques that the drones exert on the carrier at their centres, body axes [N, N m].
 
-        MuJoCo's `cfrc_int` of a drone's body is what the weld exerts on the drone: world axes, torque first,
-        about the centre of mass of the whole tree. `load_drones` and `drive` or `roll` must come first.
+        `cfrc_int` of a drone's body is what the weld exerts on the drone: world axes, torque first, about the centre of
+        mass of the whole tree. Call `load_drones` and `drive` or `roll` first.
         """
         mujoco.mj_rnePostConstraint(self.model, self.data)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
@@ -160,7 +160,7 @@ class MujocoWorld:
         return result
 
     def _external(self) -> Float[np.ndarray, " nv"]:
-        """Generalized force of `xfrc_applied`."""
+        """Generalized force (nv,) of `xfrc_applied`."""
         total = np.zeros(self.model.nv)
         for body in self._drones:
             force, torque = self.data.xfrc_applied[body, :3], self.data.xfrc_applied[body, 3:]
@@ -171,7 +171,7 @@ class MujocoWorld:
 def slide_force(
     model: mujoco.MjModel, data: mujoco.MjData, slides: slice, acceleration: Array, pushed: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, " n"]:
-    """Force [N] on the joints `slides` that gives them `acceleration` [m/s2] beside the generalized forces `pushed`."""
+    """Force [N] on the joints `slides` that accelerates them by `acceleration` [m/s2], beside the forces `pushed`."""
     count = slides.stop - slides.start
     pushes, answers = np.zeros((1 + count, model.nv)), np.empty((1 + count, model.nv))
     pushes[0] = pushed
@@ -185,7 +185,7 @@ def slide_force(
 def flown_contact_wrenches(
     config: Config, flown: PlantState, load: Load
 ) -> tuple[Float[np.ndarray, "T n drones 3"], Float[np.ndarray, "T n drones 3"]]:
-    """Contact forces and torques of recorded states (T, n, ...) from MuJoCo's internal forces."""
+    """Contact forces [N] and torques [N m] of recorded states (T, n, ...) from MuJoCo's internal forces."""
     world = MujocoWorld(config.plant, config.attitude)
     share, rolling = config.plant.moving_fraction, config.motion.kind == "rolling"
     mass = motion.object_mass(flown.time, load)

@@ -30,19 +30,19 @@ class Balance(NamedTuple):
 
 
 def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | None = None) -> Engine:
-    """Return the closed-form engine of `plant`, on NumPy or JAX arrays of any batch shape.
+    """Return the closed-form engine of `plant` on NumPy or JAX arrays of any batch shape.
 
-    `parameters`: its numbers, if they are not those of `plant`; traced ones may differ from world to world.
+    `parameters` replace those of `plant`; traced ones may differ from environment to environment.
     """
-    numbers = plant_parameters(plant, attitude) if parameters is None else parameters
+    params = plant_parameters(plant, attitude) if parameters is None else parameters
     accelerations = {"free": _free, "pivot": _pivot, "heave": _heave}[plant.stand]
-    axes, share = plant.directions, numbers.moving_fraction
+    axes, share = plant.directions, params.moving_fraction
 
     def prescribed(
         state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
     ) -> tuple[Vector, Vector]:
         offset, rate, acceleration = (_along(axes, value) for value in cg)
-        matrix, balance = _balance(numbers, state, wrench, object_mass, offset, rate, acceleration, added)
+        matrix, balance = _balance(params, state, wrench, object_mass, offset, rate, acceleration, added)
         linear, angular = accelerations(balance)
         return rotate(matrix, linear), angular
 
@@ -51,11 +51,11 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
     ) -> tuple[Vector, Vector, Array]:
         w, ball_mass = state.rates, share * object_mass
         r, speed = _along(axes, state.ball_offset), _along(axes, state.ball_rate)
-        matrix, balance = _balance(numbers, state, wrench, object_mass, share * r, share * speed, 0.0 * r, added)
+        matrix, balance = _balance(params, state, wrench, object_mass, share * r, share * speed, 0.0 * r, added)
         linear, angular = accelerations(balance)
         # m_b e . (a_b + w' x r + w x (w x r) + 2 w x r' + g u + r'') + 2/5 m_b x'' = F for the direction e of each
         # coordinate x of the ball at r; a_b and w' are linear in x''.
-        carried = cross(w, cross(w, r)) + 2.0 * cross(w, speed) + numbers.gravity * balance.down
+        carried = cross(w, cross(w, r)) + 2.0 * cross(w, speed) + params.gravity * balance.down
         known = linear + cross(angular, r) + carried
         forces = coordinates(ball_force, len(axes))
         driving = [force / ball_mass - known[..., axis] for axis, force in zip(axes, forces, strict=True)]
@@ -74,14 +74,14 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
 
 
 def _along(axes: tuple[int, ...], value: Array) -> Vector:
-    """The vector whose coordinates along the body axes `axes` are `value`."""
+    """The vector (..., 3) with the coordinates `value` along the body axes `axes` and 0 elsewhere."""
     found = dict(zip(axes, coordinates(value, len(axes)), strict=True))
     zero = 0.0 * found[axes[0]]
     return arrays.joined([found.get(axis, zero) for axis in range(3)])
 
 
 def _balance(
-    numbers: PlantParameters,
+    params: PlantParameters,
     state: PlantState,
     wrench: Wrench,
     object_mass: Scalar,
@@ -90,17 +90,17 @@ def _balance(
     acceleration: Vector,
     added: Vector | None,
 ) -> tuple[Array, Balance]:
-    """R, and the balance with the object's CG at `c`, which moves with `rate` and `acceleration` along the load's axes.
+    """R and the force and moment balance, with the object's CG at `c` moving with `rate` and `acceleration`.
 
     Terms quadratic in c are those of the moving mass alone, which is at c / share.
     """
-    m, w, g, share = object_mass[..., None], state.rates, numbers.gravity, numbers.moving_fraction
+    m, w, g, share = object_mass[..., None], state.rates, params.gravity, params.moving_fraction
     matrix = matrix_from_quaternion(state.quaternion)
     u = matrix[..., 2, :]
-    mass = (rigid_mass(numbers) + object_mass)[..., None]
-    moment = rigid_moment(numbers) + m * c
-    own = diagonal(m * numbers.object_inertia_per_mass)
-    inertia = rigid_inertia(numbers) + own + m[..., None] / share * point_inertia(c)
+    mass = (rigid_mass(params) + object_mass)[..., None]
+    moment = rigid_moment(params) + m * c
+    own = diagonal(m * params.object_inertia_per_mass)
+    inertia = rigid_inertia(params) + own + m[..., None] / share * point_inertia(c)
     if added is not None:
         inertia = inertia + diagonal(added)
     slip = 2.0 * cross(w, rate) + acceleration
@@ -118,12 +118,12 @@ def _free(balance: Balance) -> tuple[Vector, Vector]:
 
 
 def _pivot(balance: Balance) -> tuple[Vector, Vector]:
-    """O stands still and only roll is free."""
+    """Accelerations if O is fixed and only roll is free."""
     return 0.0 * balance.force, _along((0,), balance.torque[..., 0] / balance.inertia[..., 0, 0])
 
 
 def _heave(balance: Balance) -> tuple[Vector, Vector]:
-    """Only roll and the world's vertical are free: a_b = a u."""
+    """Accelerations if only roll and the world's vertical are free: a_b = a u."""
     mass, moment, inertia, down, force, torque = balance
     coupling = cross(moment, down)[..., 0]
     matrix = (mass[..., 0], coupling), (coupling, inertia[..., 0, 0])

@@ -54,26 +54,25 @@ def make_control_step(
     parameters: PlantParameters | None = None,
     autopilot: Autopilot | None = None,
 ) -> ControlStep:
-    """Return the function that advances the plant one control period with commands held.
+    """Return the function that advances the plant by one control period with commands held.
 
-    `parameters`: the plant's numbers, if they are not those of `config.plant`; the engine must have the same.
-    `autopilot` in place of the one that `config` names; commands are then what it takes.
+    `parameters` replace those of `config.plant`; the engine must have the same. `autopilot` replaces the one that
+    `config` names; commands are then those that it takes.
 
-    Each physics step samples the attitude loop, moves the rotors' first-order lag exactly (its mean force
-    acts over the step), and integrates drift-kick-drift: half a step of motion, the accelerations there,
-    the velocities, half a step of motion. One evaluation of the accelerations; second order in the step for
-    forces that depend on position and time, first order for the small ones that depend on velocity and for
-    the sampling of the attitude loop.
+    Each physics step samples the attitude loop, advances the rotors' first-order lag exactly (its mean force acts over
+    the step), and integrates drift-kick-drift: half a step of motion, the accelerations there, the velocities, half a
+    step of motion. Accelerations are evaluated once. The step is of second order for forces that depend on position and
+    time, and of first order for the small ones that depend on velocity and for the sampling of the attitude loop.
     """
     plant = config.plant
-    numbers = plant_parameters(plant, config.attitude) if parameters is None else parameters
+    params = plant_parameters(plant, config.attitude) if parameters is None else parameters
     h = config.physics_step
-    accelerate = make_accelerations(config, engine, numbers)
-    autopilot = autopilot or make_autopilot(config, numbers)
+    accelerate = make_accelerations(config, engine, params)
+    autopilot = autopilot or make_autopilot(config, params)
 
     def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         loops, target = autopilot(state, commands, load)
-        keep, mean = rotor_shares(numbers.rotor_lag, load.rotor_lag_scale, h)
+        keep, mean = rotor_shares(params.rotor_lag, load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
         if load.thrust_fade is not None:
@@ -82,7 +81,7 @@ def make_control_step(
             target = target * (state.time[..., None] < load.stop_time)[..., None]
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
-        wrench = with_external_force(total_wrench(plant, numbers, acting), middle, load)
+        wrench = with_external_force(total_wrench(plant, params, acting), middle, load)
         linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
@@ -100,7 +99,7 @@ def make_control_step(
 
 
 def rotor_shares(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
-    """Shares of the old rotor force that are left after a step of `h` [s] and, in the mean, during it; `lag` [s]."""
+    """Weights of the old rotor force after a step of `h` [s] and in its mean over the step; `lag` and `h` in [s]."""
     if scale is None and isinstance(lag, float):
         keep = math.exp(-h / lag)
         return keep, lag / h * (1 - keep)
@@ -113,14 +112,14 @@ def rotor_shares(lag: Array | float, scale: Scalar | None, h: float) -> tuple[An
 def make_accelerations(
     config: Config, engine: Engine, parameters: PlantParameters | None = None
 ) -> Callable[[PlantState, Wrench, Load], tuple[Vector, Vector, Coordinates]]:
-    """Return `accelerate(state, wrench, load)` -> (linear, angular, ball), whatever way the CG moves.
+    """Return `accelerate(state, wrench, load)` -> accelerations (linear, angular, ball) for any kind of CG motion.
 
     The ball's acceleration is 0 for prescribed motions, whose offset is a function of time alone.
     """
-    numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    share = numbers.moving_fraction
+    params = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
+    share = params.moving_fraction
     if config.motion.kind == "rolling":
-        force = motion.make_rolling_force(config, numbers)
+        force = motion.make_rolling_force(config, params)
 
         def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Coordinates]:
             mass = motion.object_mass(state.time, load)
@@ -140,7 +139,7 @@ def make_accelerations(
 
 
 def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Coordinates]:
-    """Return `cg_offset(state, load)` [m], where the CG is now."""
+    """Return `cg_offset(state, load)`, the present offset of the CG from O along the load's directions [m]."""
     if config.motion.kind == "rolling":
         return lambda state, load: config.plant.moving_fraction * state.ball_offset
     prescribed = motion.make_prescribed(config)
@@ -148,7 +147,7 @@ def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Coordinates]:
 
 
 def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
-    """`wrench` with the force on O that the world exerts."""
+    """Add the external force on O, `load.external_force` in the world, to `wrench`."""
     if load.external_force is None:
         return wrench
     matrix = rotations.matrix_from_quaternion(state.quaternion)
@@ -158,12 +157,12 @@ def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench
 def hover_rotor_force(
     config: Config, believed_mass: Scalar, parameters: PlantParameters | None = None
 ) -> Float[Array, "... drones 4"]:
-    """Rotor forces [N] that hover the believed object mass [kg] with the CG at O."""
+    """Rotor forces [N] that hover with an object of `believed_mass` [kg] and the CG at O."""
     xp = believed_mass.__array_namespace__()
-    numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.known_mass, numbers.load_share))
-    per_rotor = (own + share * believed_mass[..., None]) * numbers.gravity / 4
-    per_rotor = clipped(per_rotor, 0.0, numbers.rotor_force_max)
+    params = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
+    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (params.known_mass, params.load_share))
+    per_rotor = (own + share * believed_mass[..., None]) * params.gravity / 4
+    per_rotor = clipped(per_rotor, 0.0, params.rotor_force_max)
     return xp.stack([per_rotor] * 4, axis=-1)
 
 
@@ -176,9 +175,9 @@ def start_state(
     ball_offset: Coordinates,
     parameters: PlantParameters | None = None,
 ) -> PlantState:
-    """State at time 0 with the rotors at the believed hover thrust.
+    """State at time 0 with the rotors at hover thrust for `believed_mass`.
 
-    A stand overrules what it locks: position and velocity (height and climb stay free with `heave`), pitch, yaw.
+    A stand sets to 0 what it locks: position and velocity (height and climb stay free with `heave`), pitch, yaw.
     """
     xp = position.__array_namespace__()
     if config.plant.stand != "free":
@@ -246,10 +245,10 @@ def _jax_stepper(config: Config, physics: str) -> ControlStep:
 
 
 def on_the_host() -> AbstractContextManager[Any]:
-    """Compute on the CPU: a GPU takes 4 ms for each control step of a few worlds, most of it waiting."""
+    """Context in which JAX computes on the CPU: a GPU takes 4 ms for a control step of a few environments."""
     import jax
 
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:  # JAX was told to leave the CPU alone
+    except RuntimeError:  # the CPU backend is disabled
         return contextlib.nullcontext()

@@ -1,4 +1,4 @@
-"""The plant's numbers: a rigid team of drones and its load as a pytree of arrays. Importing it needs NumPy alone."""
+"""Parameters of the plant (rigid team of drones and load) as a pytree of arrays. Importing it needs NumPy alone."""
 
 from mjxball.plant.parameters import (
     ROLLING_INERTIA,

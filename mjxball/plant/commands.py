@@ -1,7 +1,7 @@
-"""What of a drone's rotor forces can be commanded: rows for the linear program of `mjxball.plant.trim` (ours).
+"""Rotor forces that attitude commands can produce, as rows of the linear program of `mjxball.plant.trim` (ours).
 
 At level hover an ideal attitude loop gives a torque of its gain times its tilt command, and no yaw torque. The rate
-loops of Crazyflies integrate until they hold the load: there any force can be commanded.
+loops of Crazyflies integrate until they hold the load, so commands can produce any rotor force.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Commands(NamedTuple):
-    """What drones with ideal attitude loops may be commanded."""
+    """Gains and command limits of drones with ideal attitude loops."""
 
     gains: tuple[float, float]  # of each drone's loop about roll and pitch [N m/rad]
     tilt: float  # largest roll or pitch [rad]
@@ -28,7 +28,7 @@ class Commands(NamedTuple):
 
 
 def commanded(plant: Plant | Config) -> tuple[Plant, Commands | None]:
-    """The plant, and what may be commanded; None: any force."""
+    """The plant, and its command limits; None where commands can produce any rotor force, and for a `Plant` alone."""
     if isinstance(plant, Plant):
         return plant, None
     config = plant
@@ -41,36 +41,37 @@ def commanded(plant: Plant | Config) -> tuple[Plant, Commands | None]:
 def asked_rows(
     plant: Plant, commands: Commands | None, drones: np.ndarray, factor: np.ndarray, believes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(yaw torques (A, 4 N), commands (3 A, 4 N) per force of a rotor, commands (3 A,) that hover at no force).
+    """Rows (yaw torques (A, 4 N), commands (3 A, 4 N), commands at hover (3 A,)) of the A drones numbered `drones`.
 
-    Of the A numbered `drones` that answer commands; commands over their limits. `factor` (N,) as `thrust` of
-    `largest_margin`, `believes` (N,) the mass that each drone's hover thrust is for [kg].
+    Times all rotor forces [N], the first are yaw torques, which have to be 0; the second minus commands at hover are
+    (roll, pitch, vertical) commands over their limits. `factor` (N,) as `thrust` of `largest_margin`, `believes` (N,)
+    [kg] the mass that each drone's hover thrust assumes.
     """
     columns = 4 * plant.count
     if commands is None:
         return np.zeros((0, columns)), np.zeros((0, columns)), np.zeros(0)
-    twist, asked, level = [], [], []
+    yaw_rows, rows, at_hover = [], [], []
     for number in drones:
         x, y, _ = plant.drones[number].mount
         thrust, roll, pitch, yaw = effect_of(plant, number)
         roll, pitch = roll - y * thrust, pitch + x * thrust  # about the drone's own centre
         for axis, torque in enumerate((roll, pitch)):
-            asked.append(_placed(torque / (commands.gains[axis] * commands.tilt * factor[number]), number, plant.count))
-        asked.append(_placed(thrust / (believes[number] * commands.vertical * factor[number]), number, plant.count))
-        level += [0.0, 0.0, plant.gravity / commands.vertical]
-        twist.append(_placed(yaw, number, plant.count))
-    return np.reshape(twist, (-1, columns)), np.reshape(asked, (-1, columns)), np.array(level)
+            rows.append(_placed(torque / (commands.gains[axis] * commands.tilt * factor[number]), number, plant.count))
+        rows.append(_placed(thrust / (believes[number] * commands.vertical * factor[number]), number, plant.count))
+        at_hover += [0.0, 0.0, plant.gravity / commands.vertical]
+        yaw_rows.append(_placed(yaw, number, plant.count))
+    return np.reshape(yaw_rows, (-1, columns)), np.reshape(rows, (-1, columns)), np.array(at_hover)
 
 
 def _placed(row: np.ndarray, number: int, count: int) -> np.ndarray:
-    """(4 N,) with `row` (4,) at the rotors of drone `number`."""
+    """A row (4 N,) of zeros with `row` (4,) at the rotors of drone `number`."""
     found = np.zeros((count, 4))
     found[number] = row
     return found.ravel()
 
 
 def effect_of(plant: Plant, number: int) -> Float[np.ndarray, "4 4"]:
-    """Wrench about O (T, tau_x, tau_y, tau_z) per force of each of a drone's rotors, columns rotor by rotor [1, m]."""
+    """Wrench about O (T, tau_x, tau_y, tau_z) per unit force of each rotor of one drone, a column per rotor [1, m]."""
     drone, arm = plant.drones[number], plant.of_drones("arm")[number]
     cosine, sine = math.cos(drone.yaw), math.sin(drone.yaw)
     own = lever(arm, plant.layout) * np.array(PLACES[plant.layout], dtype=float)

@@ -1,8 +1,8 @@
-"""A plant's numbers as a pytree of arrays, and what follows from them about O.
+"""Physical parameters of a plant as a pytree of arrays, and the mass and inertia about O that follow from them.
 
-Structure (how many drones, rotor layout, stand, directions of the load) is static and stays in `config.Plant`; numbers
-are `PlantParameters`. As NumPy arrays they are constants, which fold into a compiled program; as JAX arrays every world
-may have its own.
+The structure (number of drones, rotor layout, stand, directions of the load) is static and stays in `config.Plant`; the
+values are `PlantParameters`. NumPy arrays are constants, which fold into a compiled program; JAX arrays may differ from
+environment to environment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class AttitudeGains(NamedTuple):
 
 
 class PlantParameters(NamedTuple):
-    """Numbers of a plant of N drones, any batch shape in front of every array."""
+    """Parameters of a plant of N drones; every array may have leading batch axes."""
 
     drone_mass: Array  # (N,) [kg]
     own_inertia: Array  # (N, 3) principal inertia about each drone's own centre and axes [kg m2]
@@ -35,8 +35,8 @@ class PlantParameters(NamedTuple):
     yaw_per_thrust: Array  # (N,) yaw moment of a rotor over its force [m]
     rotor_force_max: Array  # (N,) [N]
     rotor_lag: Array  # (N,) time constant of a rotor's force [s]
-    known_mass: Array  # (N,) that a drone believes it lifts besides the load: itself and its share of the carrier [kg]
-    load_share: Array  # (N,) share of the load's weight that a drone believes it carries
+    known_mass: Array  # (N,) that hover thrust assumes besides the load: the drone and its share of the carrier [kg]
+    load_share: Array  # (N,) share of the load's weight that a drone's hover thrust assumes
     gains: AttitudeGains  # of each drone, about body axes
     carrier_mass: Array  # () [kg]
     carrier_inertia: Array  # (3,) about O [kg m2]
@@ -48,38 +48,38 @@ class PlantParameters(NamedTuple):
 
     @property
     def object_inertia_per_mass(self) -> Array:
-        """(3,) of the whole object about O with the CG at O, per kg of object [m2]."""
+        """Inertia (3,) of the whole object about O with the CG at O, per kg of object [m2]."""
         return self.shell_inertia_per_mass + self.ball_inertia_per_mass
 
     @property
     def drone_inertia(self) -> np.ndarray:
-        """(3, 3) inertia about O of all drones and the carrier, body axes [kg m2]; of constants alone."""
+        """Inertia (3, 3) of all drones and the carrier about O, body axes [kg m2]; of NumPy parameters."""
         return rigid_inertia(self)
 
     @property
     def size(self) -> int:
-        """How many drones there are, N."""
+        """Number of drones, N."""
         return int(self.drone_mass.shape[-1])
 
 
 def rigid_mass(parameters: PlantParameters) -> Array:
-    """() of all drones and the carrier [kg]."""
+    """Mass () of all drones and the carrier [kg]."""
     return parameters.drone_mass.sum(axis=-1) + parameters.carrier_mass
 
 
 def rigid_moment(parameters: PlantParameters) -> Array:
-    """(3,) sum of m_i r_i over the drones [kg m]; the carrier's centre is O."""
+    """First moment of mass (3,) about O: sum of m_i r_i over the drones [kg m]. The carrier's centre is O."""
     return (parameters.drone_mass[..., None] * parameters.mounts).sum(axis=-2)
 
 
 def rigid_inertia(parameters: PlantParameters) -> Array:
-    """(3, 3) about O, of all drones and the carrier, body axes [kg m2]."""
+    """Inertia (3, 3) of all drones and the carrier about O, body axes [kg m2]."""
     far = parameters.drone_mass[..., None, None] * point_inertia(parameters.mounts)
     return own_inertia(parameters).sum(axis=-3) + far.sum(axis=-3) + diagonal(parameters.carrier_inertia)
 
 
 def own_inertia(parameters: PlantParameters) -> Array:
-    """(N, 3, 3) of every drone about its own centre, body axes: Rz I Rz^T, Rz by its yaw [kg m2]."""
+    """Inertia (N, 3, 3) of each drone about its own centre, body axes: Rz I Rz^T, Rz its rotation by yaw [kg m2]."""
     xp = parameters.yaw.__array_namespace__()
     c, s, zero = xp.cos(parameters.yaw), xp.sin(parameters.yaw), xp.zeros_like(parameters.yaw)
     turn = joined([joined([c, -s, zero]), joined([s, c, zero]), joined([zero, zero, zero + 1.0])], axis=-2)
@@ -87,14 +87,14 @@ def own_inertia(parameters: PlantParameters) -> Array:
 
 
 def point_inertia(place: Array) -> Array:
-    """|r|^2 1 - r r^T (..., 3, 3) of a unit point mass at `place` r (..., 3), without differences of squares."""
+    """Inertia |r|^2 1 - r r^T (..., 3, 3) of a unit mass at `place` r (..., 3), without differences of squares."""
     x, y, z = (place[..., i] for i in range(3))
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, -x * y, -x * z, -y * z
     return joined([joined([yy + zz, xy, xz]), joined([xy, xx + zz, yz]), joined([xz, yz, xx + yy])], axis=-2)
 
 
 def diagonal(values: Array) -> Array:
-    """The matrices (..., 3, 3) with `values` (..., 3) on their diagonals."""
+    """Matrices (..., 3, 3) with `values` (..., 3) on their diagonals."""
     return values[..., None] * np.eye(3, dtype=values.dtype)
 
 
@@ -105,7 +105,7 @@ def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:
 
 
 def design_gains(inertia: Array, natural_frequency: Array, damping: float, drones: int = 2) -> AttitudeGains:
-    """Gains of one of N equal `drones` for the assembly's inertia about O (3,) [kg m2], of which each takes its part.
+    """Attitude gains of one of N equal `drones` that share an assembly with this inertia about O (3,) [kg m2].
 
     Kp = J wn^2 / N, Kd = 2 J zeta wn / N (ours).
     """
@@ -115,10 +115,10 @@ def design_gains(inertia: Array, natural_frequency: Array, damping: float, drone
 
 
 def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
-    """Constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0.
+    """Parameters of `plant` as constants, with attitude gains for an object of `attitude.design_object_mass` at c = 0.
 
-    If the whole object moves (`moving_fraction` 1) and there is no carrier, the moving mass has the box's inertia, as
-    in the reference plant; else it is a solid ball, and the fixed rest is the box.
+    If the whole object moves (`moving_fraction` 1) and there is no carrier, the moving mass has the inertia of the box,
+    as in the reference plant. Otherwise the moving mass is a solid ball and the fixed rest is the box.
     """
     drones, fraction = plant.drones, plant.moving_fraction
     box = box_inertia_per_mass(plant.object_size)

@@ -1,4 +1,4 @@
-"""Where the rotors of one drone are and how they spin: on the body axes (plus) or between them (x)."""
+"""Places of one drone's rotors and how they spin: on the body axes (plus) or between them (x)."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ SPIN = {"plus": (1, -1, 1, -1), "x": (-1, 1, -1, 1)}  # sign of the yaw moment o
 
 
 def lever(arm: Any, layout: str) -> Any:
-    """Distance of a rotor from the body axes that it lies off [m]; `arm` is that from the drone's centre."""
+    """Lever of a rotor about the body axes [m]; `arm` is its distance from the drone's centre."""
     return arm if layout == "plus" else arm / math.sqrt(2)

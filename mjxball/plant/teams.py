@@ -1,4 +1,4 @@
-"""Rigs of a training's worlds: rings of several sizes, padded to the largest, with numbers of their own."""
+"""Random rigs for training: rings of several team sizes, padded to the largest, and rigs with scaled parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOSS_MASSES, LOSS_DIRECTIONS = 6, 8
 
 
 class Factors(NamedTuple):
-    """Factors (...) on a rig's numbers, named as in `config.ScenarioRanges`."""
+    """Factors (...) on the parameters of a rig, named as in `config.ScenarioRanges`."""
 
     drone_mass_scale: Array | float = 1.0
     drone_inertia_scale: Array | float = 1.0
@@ -30,9 +30,9 @@ class Factors(NamedTuple):
 
 
 def ring(plant: Plant, count: int) -> Plant:
-    """A ring of `count` drones like the first two of `plant`, as far apart as these; the first leads (ours).
+    """A ring of `count` copies of the first drone of `plant`, spaced as its first two; drone 0 leads (ours).
 
-    The carrier is a disc of the ring's radius; its mass and the object's are those of `plant` for each drone.
+    The carrier is a disc of the ring's radius. Its mass and the object's scale with the number of drones.
     """
     first, second = plant.drones[:2]
     radius = math.dist(first.mount, second.mount) / 2 / math.sin(math.pi / count)
@@ -56,7 +56,7 @@ def ring(plant: Plant, count: int) -> Plant:
 
 
 def ring_config(config: Config, count: int) -> Config:
-    """`config` for a `ring` of `count` drones alone, with its load and attitude gains in proportion."""
+    """`config` for a `ring` of `count` drones; load and attitude gains scale with the number of drones."""
     plant, scenario, share = ring(config.plant, count), config.scenario, count / config.plant.count
     wider = plant.object_size[0] / config.plant.object_size[0]
     low, high = scenario.object_mass
@@ -70,7 +70,7 @@ def ring_config(config: Config, count: int) -> Config:
 
 
 def padded(parameters: PlantParameters, count: int) -> PlantParameters:
-    """`parameters` with drones behind the last up to `count` that weigh, lift and believe nothing."""
+    """`parameters` padded to `count` drones; added drones have no mass, no thrust and no share of the load."""
     missing = count - parameters.size
     nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass"}
 
@@ -84,7 +84,7 @@ def padded(parameters: PlantParameters, count: int) -> PlantParameters:
 
 
 def table(config: Config) -> PlantParameters:
-    """Numbers of all `scenario.team_sizes` (S, ...), padded to the plant's drones."""
+    """Parameters of all `scenario.team_sizes` (S, ...), padded to the number of drones of the plant."""
     rings = [ring_config(config, count) for count in config.scenario.team_sizes]
     found = [padded(plant_parameters(one.plant, one.attitude), config.plant.count) for one in rings]
     gains = AttitudeGains(*(np.stack(parts) for parts in zip(*(one.gains for one in found), strict=True)))
@@ -95,11 +95,11 @@ def table(config: Config) -> PlantParameters:
 
 
 def amplitudes_with_loss(config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """(masses (M,) [kg] of `scenario.object_mass`, CG amplitudes (S, N, M) [m]) that are trimmed after a loss.
+    """Object masses (M,) [kg] and CG amplitudes (S, N, M) [m] that can be held in every direction without drone n.
 
-    In every direction with `scenario.trim_margin`, by the linear program of `plant.trim`, the leader on its hover law;
-    of each of `scenario.team_sizes`, or of the plant alone, when that drone is lost, over the ring's radius in
-    proportion to the plant's. Negative: none, as for the leader. Needs SciPy.
+    Masses span `scenario.object_mass`. Amplitudes are those of the linear program of `plant.trim` with
+    `scenario.trim_margin` and the leader at hover thrust. S counts `scenario.team_sizes`, or is 1 for the plant alone;
+    a ring's are divided by its size over the plant's. Negative: none, as without the leader. Needs SciPy.
     """
     from mjxball.plant.trim import largest_amplitude
 
@@ -122,7 +122,7 @@ def amplitudes_with_loss(config: Config) -> tuple[np.ndarray, np.ndarray]:
 
 
 def varied(parameters: PlantParameters, factors: Factors, attitude: Attitude, object_mass: Array) -> PlantParameters:
-    """`parameters` times `factors`, with attitude gains for the rig as it is then, carrying `object_mass` () [kg]."""
+    """`parameters` times `factors`; the attitude gains are designed anew for that rig with `object_mass` () [kg]."""
     own, carrier = parameters.drone_mass * factors.drone_mass_scale, parameters.carrier_mass * factors.carrier_scale
     found = parameters._replace(
         drone_mass=own,

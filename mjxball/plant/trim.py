@@ -1,18 +1,19 @@
-"""Whether rotors can hold a load at hover, and how much of their range that leaves: a linear program for any plant.
+"""Rotor forces that hold a load at hover, and the margin that they leave: a linear program for any plant.
 
-The assembly hovers level. The rotors that may act must give the wrench about O that balances all weights, no yaw
-moment, less what the leader gives: four equal forces for its own weight and its share of the load, which is what its
-hover law commands at the goal. With h the share of the largest forces that lifting alone takes, a rotor of largest
-force F_max that hovers gives h F_max. A margin m leaves that share of the way to both ends of every rotor's range:
+The assembly hovers level. The rotors that may act give the wrench about O that balances all weights without a yaw
+moment. A leader that does not act gives four equal forces for its own weight and its share of the load, as its
+controller commands at the goal. With h the share of the largest forces that lifting alone takes, a rotor of largest
+force F_max hovers at h F_max. A margin m keeps every rotor from both ends of its range by m times the distance from
+hover to that end:
 
     m h F_max <= F <= F_max - m (1 - h) F_max
 
 m = 1 if all rotors hover alike, 0 if one stands still or gives its most, negative if the rotors cannot hold the load
 (ours). For a pair the upper bound is that of `mjxball.control.constants.trim_limit`, which has no lower one. A stand is
-left out of account, as if the plant flew freely. Needs SciPy.
+ignored, as if the plant flew freely. Needs SciPy.
 
-Of a whole `Config` the rotors give only what can be commanded (`mjxball.plant.commands`), and a margin m leaves that
-share of every limit of the commands, too: |command| <= (1 - m) limit.
+For a whole `Config` the rotors give only forces that can be commanded (`mjxball.plant.commands`), and a margin m leaves
+that share of every command limit, too: |command| <= (1 - m) limit.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ if TYPE_CHECKING:
 
 
 class Trim(NamedTuple):
-    """The best that rotors can do at hover."""
+    """Rotor forces at hover with the largest margin."""
 
-    margin: float  # share left of the way to both ends of the range of every rotor that acts; -inf: cannot be lifted
+    margin: float  # m above, the smallest over all rotors that act; -inf: cannot be lifted
     rotor_force: Forces | None  # every rotor's [N], rows as in plant.drones; None: cannot be lifted
 
 
 class _Hover(NamedTuple):
-    """Equations of the forces of n acting rotors: effect @ force = wrench + weight * (CG offset along x, along y).
+    """Equations of the forces of n acting rotors: effect @ force = wrench + per_offset @ (CG offset along x, along y).
 
     Forces in units of their mean `unit`, moments in metres times that.
     """
@@ -75,10 +76,10 @@ def largest_margin(
     """The trim with the largest margin for a load of `object_mass` [kg] with its CG at `cg` from O [m].
 
     `cg` is one number along a line and (x, y) in the plane. The followers' rotors act, and the leader's too if
-    `leader_helps`; else the leader lifts its share of `believed_mass` [kg], by default the true one. Rotors of the
-    drones `lost` stand still. `thrust` (N,) is what drones give of the force that they are asked for. A plant with
-    rotor_force_max inf has no upper bound. Of a `Plant` alone, any force can be commanded. Raises InputError if an
-    argument does not fit the plant.
+    `leader_helps`; otherwise the leader lifts its share of `believed_mass` [kg], by default the true mass. Rotors of
+    the drones `lost` stand still. `thrust` (N,) is the factor on each drone's forces. A plant with rotor_force_max inf
+    has no upper bound. For a `Plant` alone any force can be commanded. Raises InputError if an argument does not fit
+    the plant.
     """
     plant, commands = commanded(plant)
     hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust, commands)
@@ -121,10 +122,10 @@ def largest_amplitude(
     leader_helps: bool = False,
     thrust: Sequence[float] | None = None,
 ) -> float:
-    """CG offset [m] up to which the load can be held on both sides of O with `margin` left; negative: not even at O.
+    """Largest CG offset [m] at which the load can be held on both sides of O with `margin`; negative: not even at O.
 
-    Along `direction` (x, y) of any length, by default the load's line or x; -inf if no offset can be trimmed. The
-    other arguments are those of `largest_margin`.
+    The offset is along `direction` (x, y) of any length, by default the load's line or x; -inf if no offset can be
+    trimmed. The other arguments are those of `largest_margin`.
     """
     plant, commands = commanded(plant)
     if not margin <= 1:
@@ -152,7 +153,7 @@ def largest_amplitude(
 
 
 def heaviest_object(settings: Config, amplitude: float) -> float:
-    """The heaviest object [kg] whose CG can be held `amplitude` [m] off O with the plant's `trim_margin`, 0: none."""
+    """The heaviest object [kg] whose CG can be held `amplitude` [m] off O with the plant's `trim_margin`, or 0."""
     plant, margin = settings.plant, settings.scenario.trim_margin
     low, high = 0.0, thrust_over_weight(plant, 0.0) * total_mass(plant, 0.0)
     for _ in range(HALVINGS):
@@ -170,16 +171,16 @@ def safe_radius(
     thrust: Array | None = None,
     flies: Array | None = None,
 ) -> Array:
-    """Distance of the CG from O (...) [m] up to which followers trim the load in every direction; negative: not at O.
+    """CG distance from O (...) [m] up to which the followers trim the load in every direction; negative: not even at O.
 
-    Arrays of any batch shape and namespace, for training: a closed form that is on the safe side of `largest_margin`
-    (ours). Every drone lifts its own share, with which most teams are level at c = 0. The load's moment is held by
-    equal torques of the F followers, at most 1 / (2 L F) of it on any rotor; or, along a principal axis of their
-    mounts' scatter C about their mean, by thrusts in proportion to the distances d from it, at most |d| / (4 C) on any
-    rotor. What a weak or lost drone does not lift is lifted by all others alike, and its moment about their mean held
-    like the load's. `thrust` (..., N) is what drones give of what they are asked for; drones that do not fly
-    (`flies` (..., N) is 0) give nothing: a lost one has to be lifted, one of no mass is none. The other arguments are
-    those of `largest_margin`.
+    A closed form for training, on arrays of any batch shape and namespace, never larger than `largest_margin` allows
+    (ours). Every drone lifts its own share, with which most teams are level at c = 0. The F followers hold the load's
+    moment by equal torques, at most 1 / (2 L F) of it on any rotor; or along a principal axis of their mounts' scatter
+    C about their mean, by thrusts in proportion to their distances d from it, at most |d| / (4 C) on any rotor. Weight
+    that a weak or lost drone does not lift is shared equally by the others, and its moment about their mean is held
+    like the load's. `thrust` (..., N) is the factor on each drone's forces. Drones that do not fly (`flies` (..., N) is
+    0) give nothing: a lost one has to be lifted, one without mass is padding. The other arguments are those of
+    `largest_margin`.
     """
     xp = object_mass.__array_namespace__()
     count = parameters.size
@@ -192,7 +193,7 @@ def safe_radius(
     mass = object_mass[..., None]
     believed = mass if believed_mass is None else believed_mass[..., None]
     fair = gravity * (parameters.known_mass + parameters.load_share * mass)  # [N]
-    # What the leader and what does not fly lift too little, or the leader too much.
+    # Weight that the leader and lost drones leave to the followers; negative if the leader lifts too much.
     given = gravity * (parameters.known_mass + parameters.load_share * believed) * factor * alive
     lacking = xp.where(acts > 0, 0.0, fair - given)
     own = fair + (lacking.sum(axis=-1) / followers)[..., None]
@@ -224,7 +225,7 @@ def safe_radius(
 
 
 def _in_plane(plant: Plant, cg: float | Sequence[float]) -> np.ndarray:
-    """(x, y) of an offset along the load's directions."""
+    """(x, y) [m] of the offset `cg` along the load's directions."""
     offset = np.atleast_1d(np.asarray(cg, dtype=float))
     if offset.shape != (len(plant.directions),) or not np.isfinite(offset).all():
         raise InputError(f"the CG of this plant has {len(plant.directions)} finite coordinates [m], not {cg!r}")
@@ -242,7 +243,7 @@ def _hover(
     thrust: Sequence[float] | None,
     commands: Commands | None,
 ) -> _Hover | None:
-    """The equations, or None if the rotors that act cannot lift the assembly or need not lift anything."""
+    """The hover equations, or None if the rotors that act cannot lift the assembly or have nothing to lift."""
     count, gravity = plant.count, plant.gravity
     factor = np.ones(count) if thrust is None else np.asarray(thrust, dtype=float)
     if not 0 < object_mass < math.inf:
@@ -301,7 +302,7 @@ def _solve(
     rows: np.ndarray | None = None,
     below: np.ndarray | None = None,
 ) -> np.ndarray | None:
-    """The unknowns of least cost, or None if there are none."""
+    """The unknowns of least `cost` (equations x = equal, rows x <= below), or None if the problem is infeasible."""
     from scipy.optimize import linprog
 
     result = linprog(cost, A_ub=rows, b_ub=below, A_eq=equations, b_eq=equal, bounds=bounds, method="highs")

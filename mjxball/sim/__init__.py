@@ -1,1 +1,1 @@
-"""Simulated flight: the closed loop of sensors, drones and physics, its disturbances, and what a reset draws."""
+"""Simulated flight: the closed loop of sensors, drones and physics, its disturbances, and the reset distribution."""

@@ -1,4 +1,4 @@
-"""The closed loop of one control step: sensors, leader and follower, physics; every simulation calls it."""
+"""The closed loop of one control step, for every simulation: sensors, leader and follower, physics."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 
 class Commands(NamedTuple):
-    """What all drones are sent: roll, pitch [rad], vertical acceleration [m/s2], in body axes."""
+    """Commands of all drones: roll, pitch [rad], vertical acceleration [m/s2], in body axes."""
 
     leader: Vector
     follower: FollowerCommand
 
 
 class LoopState(NamedTuple):
-    """What the closed loop carries from step to step, any batch shape."""
+    """State of the closed loop between control steps, any batch shape."""
 
     plant: PlantState
     integral: Integral
     sensors: SensorState
-    diverged: Bool[Array, "..."]  # a plant that diverged stays as it was
+    diverged: Bool[Array, "..."]  # where true, `plant` no longer changes
 
 
 class ClosedLoop(Laws):
-    """The laws with sensors and physics: `start`, then `step` after `step`; shapes as in `sim.laws.Laws`."""
+    """Controllers with sensors and physics: call `start`, then `step` repeatedly; shapes as in `sim.laws.Laws`."""
 
     def __init__(
         self, config: Config, physics: ControlStep, sensors: SensorModel, parameters: PlantParameters | None = None
@@ -58,7 +58,7 @@ class ClosedLoop(Laws):
         delay: Int[Array, "..."] | int = 0,
         integral: Integral | None = None,
     ) -> tuple[LoopState, Observation]:
-        """(state, observation) before the first step at `plant`; `integral`: None for none yet.
+        """(state, observation) before the first step, with the plant in state `plant`; `integral` None: zero.
 
         `goal` of O [m]; `delay` (...) of the measurements in control steps.
         """
@@ -79,12 +79,12 @@ class ClosedLoop(Laws):
     ) -> tuple[LoopState, Observation, Commands]:
         """One control period: (state, observation at its end, commands).
 
-        `follower`: what the followers' law answers to `observation`, in their mount frames. `goals`: of O at the
-        period's beginning and at its end [m]. `load` with the external force that acts in it, `sample` of the
-        measurement at its end. `on_pid` (...): 1 for a network whose residual is on the PID law, 0
-        for a law of its own. `physics` in place of the loop's own.
+        `follower` is the followers' answer to `observation`, in their mount frames. `goals` are those of O at the
+        beginning and the end of the period [m]. `load` includes the external force during the period; `sample` disturbs
+        the measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
+        (`follower.residual_on_pid`), 0 for a follower whose command is complete. `physics` replaces the loop's physics.
         """
-        measured = self._leader_sees(state, observation, goals[0])
+        measured = self._leader_body(state, observation, goals[0])
         commands = self._commands(measured, state.integral, follower, goals[0], on_pid)
         plant = (physics or self._physics)(state.plant, self.stack(*commands), load)
         diverged = state.diverged | has_diverged(plant)
@@ -103,8 +103,8 @@ class ClosedLoop(Laws):
         goal: Vector,
         on_pid: Scalar | float = 1.0,
     ) -> Commands:
-        """All commands at `observation`; arguments as of `step`."""
-        return self._commands(self._leader_sees(state, observation, goal), state.integral, follower, goal, on_pid)
+        """All commands at `observation`; arguments as for `step`."""
+        return self._commands(self._leader_body(state, observation, goal), state.integral, follower, goal, on_pid)
 
     def _commands(
         self, measured: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
@@ -118,7 +118,7 @@ class ClosedLoop(Laws):
             leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, integral), follower)
         )
 
-    def _leader_sees(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
+    def _leader_body(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
         return self.body_from_observation(observation, goal) if self._leader_measures else state.plant
 
 

@@ -1,10 +1,10 @@
 """Disturbances of a flight: sensor noise, estimator drift, quantization, a relayed object error, delay, external force.
 
-`SensorModel` is the one model of a follower's sensors, on NumPy and JAX arrays. What disturbs one control step is a
-`Sample`: drawn beforehand from the seeds of scenarios (`record`; the same in every batch and on every engine), or on
-the fly from a JAX key (`RandomDisturbances`; training, where every world has its own). Of several followers each has
-errors of its own, and all have the same delay and messages. The leader flies on the truth, or on the first follower's
-measurements with `scenario.leader_uses_measurements`.
+`SensorModel` is the model of a follower's sensors, on NumPy and JAX arrays. A `Sample` holds the disturbances of one
+control step. It is sampled beforehand from the seeds of scenarios (`record`; the same in every batch and on every
+engine), or during the flight from a JAX key (`RandomDisturbances`; training, with one key per environment). Several
+followers have separate errors, but the same delay and messages. The leader flies on the true state, or on the first
+follower's measurements with `scenario.leader_uses_measurements`.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ Vector3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What disturbs one flight. The default is nothing."""
+    """Settings of the disturbances of one flight. The default is none."""
 
     noise: float = 0.0  # standard deviations of the follower's measurements, in units of `NOISE`
     delay: float = 0.0  # of the follower's measurements, a multiple of the control period [s]
-    relay_rate: float = 0.0  # e_o and its rate reach the follower this often, held in between; 0: at once [Hz]
+    relay_rate: float = 0.0  # rate at which e_o and its rate reach the follower, held in between; 0: at once [Hz]
     relay_bias: Vector3 = (0.0, 0.0, 0.0)  # added to the relayed e_o [m]
     relay_loss: float = 0.0  # share of the relayed messages that is lost
     gust: float = 0.0  # rms of a random force on O, each axis of the world [N]
@@ -69,9 +69,9 @@ def check_disturbance(disturbance: Disturbance, period: float) -> None:
 
 
 class Sample(NamedTuple):
-    """Disturbances of one control step, or with a leading axis of all steps of a flight. The default is nothing."""
+    """Disturbances of one control step, or of all steps of a flight along a leading axis. The default is none."""
 
-    errors: tuple[Observation, ...] = ()  # added to what is measured in this order
+    errors: tuple[Observation, ...] = ()  # added to the measurement in this order
     received: Bool[Array, "..."] | None = None  # whether a relayed message arrives, for each observation; None: always
     force: Vector | None = None  # external force on O in the world until the next step [N]; None: none
 
@@ -82,16 +82,16 @@ class Sample(NamedTuple):
 
 
 class SensorState(NamedTuple):
-    """What the sensors carry from step to step; () for what is not disturbed."""
+    """State of the sensors between control steps; () where a disturbance is absent."""
 
-    delay: Any = ()  # (...) control steps by which the measurements are late
+    delay: Any = ()  # (...) delay of the measurements in control steps
     relayed: Any = ()  # (..., 6) object error and its rate as last received
     past: Any = ()  # (longest delay + 1, ..., 18) measurements, newest first
 
 
 @dataclass(frozen=True, eq=False)
 class SensorModel:
-    """From the true observation to the one that the follower sees. Any batch shape, NumPy and JAX arrays."""
+    """From the true observation to the measured one. Any batch shape, NumPy and JAX arrays."""
 
     longest_delay: int = 0  # control steps
     relay_bias: Float[np.ndarray, "... 3"] | None = None  # added to the object error [m]
@@ -100,7 +100,7 @@ class SensorModel:
     def start(
         self, truth: Observation, sample: Sample, delay: Int[Array, "..."] | int = 0
     ) -> tuple[SensorState, Observation]:
-        """(state, observation) at the first step, where the truth is `truth` and has always been so."""
+        """(state, observation) at the first step, as if the true observation had always been `truth`."""
         xp = truth.__array_namespace__()
         measured, relayed = self._measure(truth, sample._replace(received=None), ())
         relayed = () if sample.received is None else relayed
@@ -110,7 +110,7 @@ class SensorModel:
         return SensorState(delay, relayed, past), measured
 
     def step(self, state: SensorState, truth: Observation, sample: Sample) -> tuple[SensorState, Observation]:
-        """(state, observation) one control step on, where the truth is `truth`."""
+        """(state, observation) one control step later, with the true observation `truth`."""
         xp = truth.__array_namespace__()
         measured, relayed = self._measure(truth, sample, state.relayed)
         relayed = () if sample.received is None else relayed
@@ -120,7 +120,7 @@ class SensorModel:
         return SensorState(state.delay, relayed, past), past[(state.delay, *np.indices(truth.shape[:-1]))]
 
     def _measure(self, truth: Observation, sample: Sample, held: Any) -> tuple[Observation, Float[Array, "... 6"]]:
-        """(what is measured now, its object part (..., 6) before it is quantized)."""
+        """The measurement now (..., 18), and its object part (..., 6) before it is quantized."""
         xp = truth.__array_namespace__()
         for error in sample.errors:
             truth = truth + error
@@ -144,7 +144,7 @@ def quantize(observation: Observation) -> Observation:
 
 
 def followers_axis(config: Config) -> tuple[int, ...]:
-    """Shape of the followers' axis: () of a pair, (F,) of several."""
+    """Shape of the followers' axis: () for a pair, (F,) for several."""
     count = len(config.plant.followers)
     return (count,) if count > 1 else ()
 
@@ -152,7 +152,7 @@ def followers_axis(config: Config) -> tuple[int, ...]:
 def sensors_of(
     disturbances: Sequence[Disturbance], period: float, followers: tuple[int, ...] = ()
 ) -> tuple[SensorModel, Int[np.ndarray, "n ..."]]:
-    """(sensors of n flights, delay of each in control steps); `followers` from `followers_axis`."""
+    """The sensors of n flights, and the delay of each in control steps; `followers` from `followers_axis`."""
     shape = (len(disturbances),) + (1,) * len(followers)
     delays = np.array([round(disturbance.delay / period) for disturbance in disturbances]).reshape(shape)
     bias = np.array([disturbance.relay_bias for disturbance in disturbances]).reshape(*shape, 3)
@@ -161,9 +161,9 @@ def sensors_of(
 
 
 def record(disturbances: Sequence[Disturbance], count: int, period: float, followers: tuple[int, ...] = ()) -> Sample:
-    """What disturbs n flights at `count` control steps, (count, n, ...), drawn from their seeds.
+    """Disturbances (count, n, ...) of n flights at `count` control steps, sampled from the flights' seeds.
 
-    More steps leave the first ones as they are. `followers` from `followers_axis`.
+    The first steps do not depend on `count`. `followers` from `followers_axis`.
     """
     errors = _stack([_recorded_errors(disturbance, (count, *followers), period) for disturbance in disturbances])
     received = _stack([_received(disturbance, count, period) for disturbance in disturbances])
@@ -174,7 +174,7 @@ def record(disturbances: Sequence[Disturbance], count: int, period: float, follo
 
 
 def _stack(tables: list[np.ndarray | None]) -> np.ndarray | None:
-    """Tables of all flights along axis 1, with what 'nothing' means where one has none; None if nobody has one."""
+    """Tables of all flights along axis 1, neutral values for a flight without a table; None if no flight has one."""
     given = [table for table in tables if table is not None]
     if not given:
         return None
@@ -189,7 +189,7 @@ def _random(disturbance: Disturbance, stream: int) -> np.random.Generator:
 def _recorded_errors(
     disturbance: Disturbance, shape: tuple[int, ...], period: float
 ) -> Float[np.ndarray, "count ... 18"] | None:
-    """Noise and estimator drift, in float32."""
+    """Noise plus estimator drift of all steps in float32, or None without either."""
     if not (disturbance.noise or disturbance.estimator_drift):
         return None
     white = _random(disturbance, 1).standard_normal((*shape, OBSERVATION_SIZE), np.float32)
@@ -201,7 +201,7 @@ def _recorded_errors(
 
 
 def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.ndarray, " count"] | None:
-    """True at the steps where a relayed message arrives; the first one always does."""
+    """(count,) true at the steps where a relayed message arrives; the first one always does."""
     if not disturbance.relay_rate:
         return None
     sent = np.floor(np.arange(count) * period * disturbance.relay_rate + 1e-9)
@@ -212,14 +212,14 @@ def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.nd
 
 
 def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndarray, "count 3"] | None:
-    """A first-order Gauss-Markov force [N] that starts in its steady state."""
+    """(count, 3) first-order Gauss-Markov force [N] that starts in its steady state."""
     if not disturbance.gust:
         return None
     return disturbance.gust * _walk(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
 
 
 def _walk(fresh: Float[np.ndarray, "count ..."], share: float) -> Float[np.ndarray, "count ..."]:
-    """All steps of `gauss_markov` from white `fresh`, of which the first is the start."""
+    """All steps of `gauss_markov` driven by white noise `fresh`, whose first value is the start."""
     slow = fresh.copy()
     for number in range(1, len(fresh)):
         slow[number] = gauss_markov(slow[number - 1], fresh[number], share)
@@ -227,18 +227,18 @@ def _walk(fresh: Float[np.ndarray, "count ..."], share: float) -> Float[np.ndarr
 
 
 def gauss_markov(before: Array, fresh: Array, share: float, deviation: Array | float = 1.0) -> Array:
-    """The next step of a first-order Gauss-Markov process of that `deviation`.
+    """The next value of a first-order Gauss-Markov process with this standard `deviation`.
 
-    `fresh` is white, of deviation 1; `share` of the process's time constant passes.
+    `fresh` is white noise of deviation 1; `share` is the step over the time constant.
     """
     keep = math.exp(-share)
     return keep * before + deviation * math.sqrt(1 - keep * keep) * fresh
 
 
 def measurement_errors(noise: Array | float, white: Array, drift: Array | None) -> tuple[Array, ...]:
-    """Errors of a measurement: `noise` () level times `white` (..., 18), and the slow `drift` (..., 18) if there is.
+    """Errors of a measurement: `noise` () level times `white` (..., 18), and the slow `drift` (..., 18) if given.
 
-    `white` is of deviation 1, `drift` of the deviation that is its level.
+    `white` has deviation 1, `drift` has its level as deviation.
     """
     xp = white.__array_namespace__()
     noisy = noise * xp.asarray(NOISE, dtype=white.dtype) * white
@@ -246,7 +246,7 @@ def measurement_errors(noise: Array | float, white: Array, drift: Array | None) 
 
 
 class RandomState(NamedTuple):
-    """What one world's random disturbances carry from step to step."""
+    """State of one environment's random disturbances between control steps."""
 
     key: Array
     noise: Float[Array, ""]  # level, in units of `NOISE`
@@ -258,7 +258,7 @@ class RandomState(NamedTuple):
 
 
 class RandomDisturbances:
-    """Disturbances of one world of training, levels drawn from the ranges of `config.scenario` at its reset. JAX."""
+    """Random disturbances of one training environment, with levels sampled from `config.scenario` at its reset. JAX."""
 
     def __init__(self, config: Config):
         scenario, self._period = config.scenario, config.timing.control_period
@@ -269,16 +269,16 @@ class RandomDisturbances:
         self._shape = (*followers_axis(config), OBSERVATION_SIZE)
 
     def start(self, key: Array) -> tuple[Any, Sample]:
-        """(state, sample of the first step) of a world that is reset; state () if nothing is disturbed."""
+        """(state, sample of the first step) of an environment at its reset; the state is () if nothing is disturbed."""
         from jax import numpy as jnp
         from jax import random
 
         if not self.present:
             return (), Sample()
-        draw_key, key = random.split(key)
-        share = random.uniform(draw_key, (3,))
+        level_key, key = random.split(key)
+        share = random.uniform(level_key, (3,))
         noise, delay, gust = (low + (high - low) * u for (low, high), u in zip(self._ranges, share, strict=True))
-        calm = random.uniform(random.fold_in(draw_key, 1)) < self._calm
+        calm = random.uniform(random.fold_in(level_key, 1)) < self._calm
         noise, gust = jnp.where(calm, 0.0, noise), jnp.where(calm, 0.0, gust)
         key, noise_key, force_key = random.split(key, 3)
         drift: Any = ()
@@ -292,7 +292,7 @@ class RandomDisturbances:
         return state, self._sample(state, noise_key)
 
     def step(self, state: Any) -> tuple[Any, Sample]:
-        """(state, sample) one control period on."""
+        """(state, sample) one control period later."""
         from jax import random
 
         if not self.present:

@@ -1,4 +1,4 @@
-"""What is around the follower's network for a configuration."""
+"""Builds from a configuration the processing around a follower's network."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mjxball.control.observation import observation_history
 
 
 def follower_law(config: Config) -> FollowerLaw:
-    """What is around the network of `config.follower`."""
+    """Observation history, action scaling and limits around the network of `config.follower`."""
     follower, leader = config.follower, config.leader
     return FollowerLaw(
         history=observation_history(config),

@@ -1,4 +1,4 @@
-"""What of a rig lies outside the ranges that a follower for any rig was trained with (ours)."""
+"""Checks a rig against the random rigs that a follower was trained on (ours)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mjxball.sim import rigs
 
 
 def outside(config: Config, trained: Config) -> list[str]:
-    """What of the rig of `config` lies outside what `trained` draws rigs from, one phrase each."""
+    """Properties of the rig of `config` outside the ranges of random rigs in `trained`, one phrase each."""
     plant, sizes = config.plant, trained.scenario.team_sizes
     drones, gravity = plant.drones, plant.gravity
     masses = [drone.mass for drone in drones]
@@ -50,7 +50,7 @@ def outside(config: Config, trained: Config) -> list[str]:
 
 
 def _answered_tilt(config: Config, hover: float) -> float:
-    """Tilt step that all drones' loops answer without saturation [rad]; a rotor hovers with `hover` [N]."""
+    """Tilt step [rad] that all drones' loops answer without saturation; `hover` is a rotor's force at hover [N]."""
     plant = config.plant
     arms, strongest = (np.array(plant.of_drones(name)) for name in ("arm", "rotor_force_max"))
     gains = plant_parameters(plant, config.attitude).gains

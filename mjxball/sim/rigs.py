@@ -1,7 +1,7 @@
 """Random rigs: teams of drones, carriers and loads of every size (ours).
 
-Lengths grow with the cube root of a drone's mass, inertia with mass and square of length, as they do from a Crazyflie
-to a drone of 3 kg; factors of a draw come on top. Needs NumPy alone.
+Lengths grow with the cube root of a drone's mass, inertia with mass and square of length, as from a Crazyflie to a
+drone of 3 kg. Random factors apply on top. Needs NumPy alone.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from mjxball.plant.trim import safe_radius
 # A drone of 1 kg: arm [m], inertia over mass and arm^2 about (roll, pitch, yaw); the pair's.
 ARM, GYRATION = 0.12, np.array([0.16, 0.16, 0.28])
 CARRIER_THICKNESS = 0.04  # edge of the carrier across, over its diameter
-# What is drawn: by factor, that is evenly in the logarithm, where it says so, else evenly.
+# Sampled ranges: uniform, or log-uniform where marked "by factor".
 DRONE_MASS = (0.03, 3.0)  # of each drone, by factor [kg]
 ARM_SCALE = (0.8, 1.25)  # on the rotors' arm, which is ARM at 1 kg
-INERTIA_SCALE = (0.7, 1.4)  # on a drone's own inertia
+INERTIA_SCALE = (0.7, 1.4)  # on a drone's inertia
 SPACING = (2.3, 4.5)  # distance of neighbours on the ring over the arm
 MOUNT_JITTER = 0.1  # each mount is off the even ring by up to this share of its radius and of the angle between two
 YAW_PER_THRUST = (0.1, 0.25)  # yaw moment of a rotor over its force, over the arm
@@ -35,62 +35,61 @@ ROTOR_LAG = (0.015, 0.15)  # time constant, by factor [s]
 CARRIER_SHARE = (0.02, 0.1)  # mass of the carrier over that of all drones
 OBJECT_SHARE = (0.05, 0.6)  # mass of the object over that of all drones
 BELIEVED_SCALE = (0.5, 2.0)  # on the object's mass, by factor: what every drone assumes
-THRUST_SCALE = (0.8, 1.2)  # share that each drone gives of the force it is asked for
+THRUST_SCALE = (0.8, 1.2)  # factor on each drone's rotor forces
 THRUST_FADE = (0.0, 0.002)  # share of all thrust that is lost in a second as batteries empty [1/s]
 LOOP_FREQUENCY = (4.0, 20.0)  # natural frequency of the pitch loop, by factor [rad/s]
 FREQUENCY_RATIO = (0.8, 1.25)  # of the roll loop to that of pitch, by factor
 YAW_RATIO = 0.4  # of the yaw loop to that of pitch
 LOOP_DAMPING = (0.5, 1.1)  # of the attitude loops without rotor lag
-UNSATURATED_TILT = 0.15  # step that all rotors answer without saturation, at least: it caps the pitch loop [rad]
-LEAST_DAMPING = 0.3  # of the attitude loops with rotor lag; a rig with less is drawn anew
-# Wrong beliefs and uneven thrusts are drawn back by three tenths, at most 8 times, while they leave the CG less than a
-# tenth of the rig's length; a rig whose CG can go less far than a fiftieth is drawn anew.
+UNSATURATED_TILT = 0.15  # smallest step that rotors must answer without saturation: it caps the pitch loop [rad]
+LEAST_DAMPING = 0.3  # of the attitude loops with rotor lag; a rig with less is rejected
+# While the CG's reach is below a tenth of the rig's length, believed mass and thrusts are moved towards the truth by
+# three tenths, at most 8 times. A rig with a reach below a fiftieth is rejected.
 TRAINING, HELD_OUT = 1, 2  # seeds
 HELD_OUT_RIGS = 200  # of each number of drones
-DRAWN_BACK, WANTED_REACH, LEAST_REACH = 8, 0.1, 0.02
+SHRINKS, ENOUGH_REACH, LEAST_REACH = 8, 0.1, 0.02
 
 
 class RigTable(NamedTuple):
-    """R rigs, padded to as many drones as the largest team has. Drone 0 leads, the others stand behind it in order."""
+    """R rigs, padded to the largest number of drones. Drone 0 leads; padding comes last."""
 
-    numbers: PlantParameters  # (R, ...); None for what is the same for all rigs, see `whole`
-    size: Array  # (R,) how many drones fly
+    numbers: PlantParameters  # (R, ...); None for values common to all rigs, see `whole`
+    size: Array  # (R,) number of drones without padding
     object_mass: Array  # (R,) true [kg]
     believed_mass: Array  # (R,) that every drone assumes [kg]
-    thrust: Array  # (R, N) share that each drone gives of the force it is asked for, with a full battery
+    thrust: Array  # (R, N) factor on each drone's rotor forces, with a full battery
     thrust_fade: Array  # (R,) share of all thrust that is lost in a second as batteries empty [1/s]
-    reach: Array  # (R,) how far the CG may be from O, so that followers can trim it and it stays on the carrier [m]
+    reach: Array  # (R,) largest distance of the CG from O that followers can trim, on the carrier [m]
     length: Array  # (R,) largest distance of a drone from O [m]
     frequency: Array  # (R, 3) natural frequency of the attitude loops about roll, pitch, yaw [rad/s]
-    damping: Array  # (R,) of these without rotor lag
+    damping: Array  # (R,) of these loops without rotor lag
 
     @property
     def total(self) -> int:
-        """R."""
+        """Number of rigs, R."""
         return len(self.size)
 
     def rows(self, chosen: Any) -> RigTable:
-        """The rigs `chosen`, any index of the first axis."""
+        """The rigs `chosen`, by any index of the first axis."""
         return RigTable(_each(lambda part: part[chosen], self.numbers), *(part[chosen] for part in self[1:]))
 
 
 class Drawn(NamedTuple):
-    """Rigs, and what became of the draws."""
+    """Sampled rigs, and the numbers of samples and rejections."""
 
     rigs: RigTable
     draws: int
-    unstable: int  # rejected: poles of the attitude loop with its rotor lag are damped by less than LEAST_DAMPING, or
-    # the rotors are too weak for the slowest loop
-    untrimmed: int  # rejected: followers cannot hold the load at O, however close beliefs and thrusts are to the truth
+    unstable: int  # rejected: damping with rotor lag below LEAST_DAMPING, or rotors too weak for the slowest loop
+    untrimmed: int  # rejected: CG reach too short even with believed mass and thrusts close to the truth
 
 
 def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
-    """`count` rigs of `size` drones, padded to the plant's drones; a `seed` draws the same."""
+    """`count` rigs of `size` drones, padded to the drones of `config.plant`; the same `seed` gives the same rigs."""
     random = np.random.default_rng([seed, size])
     parts: list[RigTable] = []
     draws = damped = untrimmed = 0
     while sum(part.total for part in parts) < count:
-        table, steady, held = _draw(config, size, 2 * count + 16, random)
+        table, steady, held = _sample(config, size, 2 * count + 16, random)
         good = steady & held
         missing = count - sum(part.total for part in parts)
         last = np.flatnonzero(good)[:missing][-1] + 1 if good.sum() >= missing else len(good)
@@ -105,9 +104,9 @@ def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
 
 def training_rigs(config: Config) -> RigTable:
     """`rigs.number` rigs of each of `scenario.team_sizes`, (sizes, number, ...), in float32."""
-    drawn = [draw_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
-    table = joined(drawn)
-    shape = (len(drawn), config.rigs.number)
+    sampled = [draw_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
+    table = joined(sampled)
+    shape = (len(sampled), config.rigs.number)
 
     def folded(part: Array) -> Array:
         return np.asarray(part, np.float32).reshape(*shape, *part.shape[1:])
@@ -117,20 +116,20 @@ def training_rigs(config: Config) -> RigTable:
 
 @functools.lru_cache(maxsize=16)
 def held_out(config: Config, size: int, count: int = HELD_OUT_RIGS) -> RigTable:
-    """`count` rigs of `size` drones that no training draws, without padding; another `count` draws others."""
+    """`count` rigs of `size` drones that no training uses, without padding; another `count` gives other rigs."""
     return unpadded(draw_rigs(config, size, count, HELD_OUT).rigs, size)
 
 
 def joined(tables: list[RigTable]) -> RigTable:
-    """All rigs of `tables`, one after the other."""
-    numbers = _each(lambda *parts: np.concatenate(parts), *(table.numbers for table in tables))
-    return RigTable(numbers, *(np.concatenate(parts) for parts in zip(*(t[1:] for t in tables), strict=True)))
+    """The rigs of all `tables`, one table after the other."""
+    parameters = _each(lambda *parts: np.concatenate(parts), *(table.numbers for table in tables))
+    return RigTable(parameters, *(np.concatenate(parts) for parts in zip(*(t[1:] for t in tables), strict=True)))
 
 
-def whole(numbers: PlantParameters, gravity: float) -> PlantParameters:
-    """`numbers` with what is the same for all rigs, as constants that fold into a compiled program."""
-    count = numbers.drone_mass.shape[-1]
-    return numbers._replace(
+def whole(parameters: PlantParameters, gravity: float) -> PlantParameters:
+    """`parameters` with the values common to all rigs filled in, as constants that fold into a compiled program."""
+    count = parameters.drone_mass.shape[-1]
+    return parameters._replace(
         yaw=np.zeros(count),
         moving_fraction=np.array(1.0),
         shell_inertia_per_mass=np.zeros(3),
@@ -138,11 +137,11 @@ def whole(numbers: PlantParameters, gravity: float) -> PlantParameters:
     )
 
 
-def _each(function: Callable[..., Any], *numbers: PlantParameters) -> PlantParameters:
-    """`function` of every array of all `numbers`."""
+def _each(function: Callable[..., Any], *parameters: PlantParameters) -> PlantParameters:
+    """Apply `function` to every array of all `parameters`."""
     found: dict[str, Any] = {}
     for name in PlantParameters._fields:
-        parts = [getattr(one, name) for one in numbers]
+        parts = [getattr(one, name) for one in parameters]
         if name == "gains":
             found[name] = AttitudeGains(*(function(*gains) for gains in zip(*parts, strict=True)))
         else:
@@ -151,10 +150,10 @@ def _each(function: Callable[..., Any], *numbers: PlantParameters) -> PlantParam
 
 
 def loop_damping(frequency: Array, damping: Array, lag: Array) -> Array:
-    """Damping (...) of the least damped poles of an attitude loop (rad/s, 1) behind rotors with a `lag` [s].
+    """Damping (...) of the least damped poles of an attitude loop (rad/s, 1) with rotors of `lag` [s].
 
-    Poles p of T p^3 + p^2 + 2 zeta p + 1 in units of the natural frequency, T = lag wn: a real one, found by bisection,
-    and two others (closed form).
+    Poles p of T p^3 + p^2 + 2 zeta p + 1 in units of the natural frequency, T = lag wn: a real one by bisection, and
+    the other two in closed form.
     """
     scaled = np.asarray(lag * frequency, float)
     low, high = np.zeros_like(scaled) - (1 / scaled + 2 * damping + 2), np.zeros_like(scaled)
@@ -167,8 +166,8 @@ def loop_damping(frequency: Array, damping: Array, lag: Array) -> Array:
     return (1 / scaled + real) / 2 / np.sqrt(product)
 
 
-def _draw(config: Config, size: int, count: int, random: np.random.Generator) -> tuple[RigTable, Array, Array]:
-    """(rigs, whether their loops are damped, whether their loads can be trimmed), `count` of each."""
+def _sample(config: Config, size: int, count: int, random: np.random.Generator) -> tuple[RigTable, Array, Array]:
+    """`count` sampled rigs, whether each one's loops are damped enough, and whether its load can be trimmed."""
     most, gravity = max(config.plant.count, size), config.plant.gravity
 
     def even(ends: Range, *shape: int) -> Array:
@@ -202,7 +201,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
 
     own = alike(mass)
     ball = 0.4 * (0.1 * length) ** 2
-    numbers = PlantParameters(
+    parameters = PlantParameters(
         drone_mass=own,
         own_inertia=np.repeat(inertia[:, None], size, axis=1),
         mounts=mounts,
@@ -222,9 +221,9 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
         ball_limit=length,
         gravity=None,
     )
-    empty = rigid_inertia(whole(numbers, gravity))
+    empty = rigid_inertia(whole(parameters, gravity))
     about = [empty[:, axis, axis] + load * ball for axis in range(3)]
-    # The loop is as fast as it was drawn, up to what the rotors can give for a step of `UNSATURATED_TILT`.
+    # The sampled frequency is capped where the rotors saturate at a step of `UNSATURATED_TILT`.
     hover = gravity * (mass * size + carrier + load) / (4 * size)
     room = torque_room(arm, config.plant.layout, hover, strongest)
     slowest, fastest = LOOP_FREQUENCY
@@ -232,19 +231,19 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
     pitch = slowest * (np.clip(stiffest, slowest, fastest) / slowest) ** place
     frequency = np.stack([pitch * ratio, pitch, YAW_RATIO * pitch], axis=-1)
     kp, kd = (np.stack(list(gain), axis=-1) for gain in design_gains(about, frequency.T, damping, size))
-    numbers = numbers._replace(gains=AttitudeGains(kp, kd))
+    parameters = parameters._replace(gains=AttitudeGains(kp, kd))
     steady = loop_damping(frequency[:, :2].max(axis=-1), damping, lag) >= LEAST_DAMPING
     steady &= stiffest >= slowest
 
-    constants, limits = whole(numbers, gravity), (config.scenario.trim_margin, *command_limits(config))
+    constants, limits = whole(parameters, gravity), (config.scenario.trim_margin, *command_limits(config))
     reach = trimmed_reach(constants, load, believed, thrust, *limits)
-    for _ in range(DRAWN_BACK):
-        short = reach < WANTED_REACH * length
+    for _ in range(SHRINKS):
+        short = reach < ENOUGH_REACH * length
         believed = np.where(short, load * (believed / load) ** 0.7, believed)
         thrust = np.where(short[:, None], 1 + 0.7 * (thrust - 1), thrust)
         reach = trimmed_reach(constants, load, believed, thrust, *limits)
     table = RigTable(
-        numbers=_padded(numbers, most),
+        numbers=_with_padding(parameters, most),
         size=np.full(count, size),
         object_mass=load,
         believed_mass=believed,
@@ -259,7 +258,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
 
 
 def trimmed_reach(
-    numbers: PlantParameters,
+    parameters: PlantParameters,
     load: Array,
     believed: Array,
     thrust: Array,
@@ -267,23 +266,23 @@ def trimmed_reach(
     tilt_limit: float,
     vertical_limit: float,
 ) -> Array:
-    """How far the CG may be from O (...) by the followers' rotors and by what commands may ask for [m]; negative: not.
+    """Distance of the CG from O (...) [m] that rotors and command limits of the followers can hold; negative: none.
 
-    `safe_radius`, with the same `margin` of the commands' limits (rad, m/s2) left: tilt commands hold the load's moment
-    and that of uneven thrusts, vertical ones lift alike what the leader does not.
+    The smaller of `safe_radius` and what commands hold with the same `margin` of their limits (rad, m/s2) left. Tilt
+    commands hold the moments of load and uneven thrusts; vertical ones share what the leader does not lift.
     """
     xp = load.__array_namespace__()
-    rotors = safe_radius(numbers, 0, load, margin, believed, thrust)
-    gravity = float(numbers.gravity)
-    flies = xp.astype(numbers.drone_mass > 0, load.dtype)[..., 1:]
+    rotors = safe_radius(parameters, 0, load, margin, believed, thrust)
+    gravity = float(parameters.gravity)
+    flies = xp.astype(parameters.drone_mass > 0, load.dtype)[..., 1:]
     followers = flies.sum(axis=-1)
-    fair = gravity * (numbers.known_mass + numbers.load_share * load[..., None])
-    assumed = numbers.known_mass + numbers.load_share * believed[..., None]
+    fair = gravity * (parameters.known_mass + parameters.load_share * load[..., None])
+    assumed = parameters.known_mass + parameters.load_share * believed[..., None]
     lacking = fair[..., 0] - gravity * assumed[..., 0] * thrust[..., 0]
-    middle = (flies[..., None] * numbers.mounts[..., 1:, :2]).sum(axis=-2) / followers[..., None]
-    lever = middle - numbers.mounts[..., 0, :2]
+    middle = (flies[..., None] * parameters.mounts[..., 1:, :2]).sum(axis=-2) / followers[..., None]
+    lever = middle - parameters.mounts[..., 0, :2]
     uneven = xp.abs(lacking) * xp.hypot(lever[..., 0], lever[..., 1])
-    gain = xp.min(numbers.gains.kp[..., :2], axis=-1) * (flies * thrust[..., 1:]).sum(axis=-1)
+    gain = xp.min(parameters.gains.kp[..., :2], axis=-1) * (flies * thrust[..., 1:]).sum(axis=-1)
     held = (1 - margin) * gain * tilt_limit
     wanted = (fair[..., 1:] + (lacking / followers)[..., None]) / thrust[..., 1:]
     asked = xp.abs(wanted / xp.where(flies > 0, assumed[..., 1:], 1.0) - gravity)
@@ -292,7 +291,7 @@ def trimmed_reach(
 
 
 def command_limits(config: Config) -> tuple[float, float]:
-    """What a follower may command in all: rad, m/s2; a residual may be tighter."""
+    """Largest tilt [rad] and vertical acceleration [m/s2] of a follower, its action scale included."""
     follower, most = config.follower, config.command
     return min(follower.action_scale_tilt, most.tilt_limit), min(follower.action_scale_vertical, most.vertical_limit)
 
@@ -307,20 +306,20 @@ def _load_shares(mounts: Array) -> Array:
     return 1 / places.shape[1] - np.einsum("rni,ri->rn", off, weights)
 
 
-def _padded(numbers: PlantParameters, count: int) -> PlantParameters:
-    """`numbers` with drones behind the last up to `count` that weigh, lift and believe nothing."""
-    missing = count - numbers.size
+def _with_padding(parameters: PlantParameters, count: int) -> PlantParameters:
+    """`parameters` padded to `count` drones; added drones have no mass, no thrust and no share of the load."""
+    missing = count - parameters.size
     nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass"}
     found: dict[str, Any] = {}
     for name in (*nothing, "mounts", "arm", "yaw_per_thrust", "rotor_lag"):
-        value = getattr(numbers, name)
+        value = getattr(parameters, name)
         more = np.repeat(value[:, -1:], missing, axis=1)
         found[name] = np.concatenate([value, 0.0 * more if name in nothing else more], axis=1)
-    return numbers._replace(**found)
+    return parameters._replace(**found)
 
 
 def unpadded(rigs: RigTable, size: int) -> RigTable:
-    """`rigs`, all of `size` drones, without the drones that pad."""
+    """`rigs`, all of `size` drones, without padding."""
     padded = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass", "mounts", "arm"}
     padded |= {"yaw_per_thrust", "rotor_lag"}
     cut: dict[str, Any] = {name: getattr(rigs.numbers, name)[:, :size] for name in padded}
@@ -328,25 +327,25 @@ def unpadded(rigs: RigTable, size: int) -> RigTable:
 
 
 def rig_config(config: Config, rigs: RigTable, row: int) -> Config:
-    """`config` for the rig `row` alone: its plant, attitude loops and nominal load, for whoever is told the rig."""
-    numbers, size = rigs.numbers, int(rigs.size[row])
+    """`config` for the rig `row` alone, with its plant, attitude loops and nominal load."""
+    parameters, size = rigs.numbers, int(rigs.size[row])
     drones = tuple(
         Drone(
-            mass=float(numbers.drone_mass[row, k]),
-            inertia=_tuple(numbers.own_inertia[row, k]),
-            mount=_tuple(numbers.mounts[row, k]),
-            arm=float(numbers.arm[row, k]),
-            rotor_force_max=float(numbers.rotor_force_max[row, k]),
-            rotor_lag=float(numbers.rotor_lag[row, k]),
-            yaw_per_thrust=float(numbers.yaw_per_thrust[row, k]),
+            mass=float(parameters.drone_mass[row, k]),
+            inertia=_tuple(parameters.own_inertia[row, k]),
+            mount=_tuple(parameters.mounts[row, k]),
+            arm=float(parameters.arm[row, k]),
+            rotor_force_max=float(parameters.rotor_force_max[row, k]),
+            rotor_lag=float(parameters.rotor_lag[row, k]),
+            yaw_per_thrust=float(parameters.yaw_per_thrust[row, k]),
         )
         for k in range(size)
     )
     length, load = float(rigs.length[row]), float(rigs.object_mass[row])
     plant = Plant(
         drones=drones,
-        carrier_mass=float(numbers.carrier_mass[row]),
-        carrier_inertia=_tuple(numbers.carrier_inertia[row]),
+        carrier_mass=float(parameters.carrier_mass[row]),
+        carrier_inertia=_tuple(parameters.carrier_inertia[row]),
         object_mass=load,
         object_size=(2 * length, 2 * length, 2 * CARRIER_THICKNESS * length),
         ball_radius=0.1 * length,
@@ -366,7 +365,7 @@ def rig_config(config: Config, rigs: RigTable, row: int) -> Config:
 
 
 def torque_room(arm: Array, layout: str, hover: Array, strongest: Array) -> Array:
-    """Roll or pitch torque that a drone's rotors have at hover [N m]; forces of a rotor [N]."""
+    """Largest roll or pitch torque of a drone at hover [N m]; rotor forces `hover` and `strongest` in [N]."""
     return torque_per_force(arm, layout) * np.minimum(hover, strongest - hover)
 
 

@@ -1,4 +1,4 @@
-"""`Scenario`: one flight to be flown, and what makes it unsound."""
+"""`Scenario`, the settings of one flight, and the checks on it."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class CgPath:
 
 FASTEST, HEAVIEST = range_of("scenario.cg_speed")[1], range_of("scenario.object_mass")[1]
 CIRCLE = CgPath(width=1.0, lead=math.pi / 2)
-OF_PLANT: Any = None  # of a scenario's number: what the plant says, see `of_plant`
-AMPLITUDE, GOAL = 0.05, 1.0  # [m] of a plant that allows them
-MOVES = {"free": (1.0, 1.0, 1.0), "pivot": (0.0, 0.0, 0.0), "heave": (0.0, 0.0, 1.0)}  # axes that a stand leaves O
+OF_PLANT: Any = None  # value of a field that is taken from the plant, see `of_plant`
+AMPLITUDE, GOAL = 0.05, 1.0  # [m] where the plant allows them
+MOVES = {"free": (1.0, 1.0, 1.0), "pivot": (0.0, 0.0, 0.0), "heave": (0.0, 0.0, 1.0)}  # by stand: axes free for O
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal.
+    """One flight from rest at the origin, with rotors at the believed hover thrust, to the goal.
 
-    How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here. Load and
-    goal that are not given are those of the plant that flies (`of_plant`).
+    How the CG moves (sine, waveform, rolling ball) is set by `config.motion`; the parameters of a sine are here. Load
+    and goal that are not given are those of the plant (`of_plant`).
     """
 
     omega: float = 0.31  # angular speed of the CG's sine [rad/s]
@@ -60,27 +60,27 @@ class Scenario:
 
 
 def of_plant(config: Config, scenario: Scenario) -> Scenario:
-    """`scenario` with the load and the goal of `config`'s plant where it gives none.
+    """`scenario` with load and goal of `config`'s plant where it gives none.
 
-    The mass is the plant's, drawn in to what training may draw. The CG goes as far as the object and training's draws
-    allow, 5 cm at most. The goal is 1 m away on every axis that a stand leaves free, drawn in likewise.
+    The mass is the plant's, clipped to the training range. The amplitude is 5 cm, the goal 1 m away on every axis that
+    a stand leaves free; both are less where the object or the training range is smaller.
     """
     ranges, plant = config.scenario, config.plant
     distance = min(GOAL, ranges.goal_range)
-    own: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "mass": min(max(plant.object_mass, ranges.object_mass[0]), ranges.object_mass[1]),
         "amplitude": min(AMPLITUDE, cg_limit(plant), ranges.cg_amplitude[1]),
         "goal": tuple(distance * free for free in MOVES[plant.stand]),
     }
-    return replace(scenario, **{name: value for name, value in own.items() if getattr(scenario, name) is OF_PLANT})
+    return replace(scenario, **{name: value for name, value in defaults.items() if getattr(scenario, name) is OF_PLANT})
 
 
 def check_scenario(config: Config, scenario: Scenario) -> Scenario:
-    """`scenario` with what `of_plant` fills in; InputError with one sentence if it makes no sense on the plant."""
+    """`scenario` completed by `of_plant`; raises InputError with one sentence if it does not fit the plant."""
     scenario = of_plant(config, scenario)
     if len(scenario.goal) != 3:
         raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
-    if not np.isfinite(_numbers(astuple(scenario))).all():
+    if not np.isfinite(_flat(astuple(scenario))).all():
         raise InputError("every number of a scenario must be finite")
     if scenario.mass <= 0:
         raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
@@ -133,8 +133,8 @@ def _check_goals(config: Config, scenario: Scenario) -> None:
         raise InputError("waypoints must come in order of time, after the start")
 
 
-def _numbers(value: Any) -> list[float]:
-    """Every number in nested tuples; None counts for nothing."""
+def _flat(value: Any) -> list[float]:
+    """All values in nested tuples as floats, without None."""
     if isinstance(value, tuple):
-        return [number for part in value for number in _numbers(part)]
+        return [number for part in value for number in _flat(part)]
     return [] if value is None else [float(value)]
