@@ -60,14 +60,12 @@ LAWS: dict[str, Callable[[Config], Law]] = {
 }
 # In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
 SUITE_BASELINES = tuple(name for name in LAWS if name not in ("lqg-known-failures", "mpc"))
-FORMER_NAMES = {"lqg-told": "lqg-known-failures"}
 VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
 BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
 
 
 def make_law(name: str, config: Config) -> Law:
     """The classical controller called `name` with gains that follow from `config`; InputError if unknown."""
-    name = FORMER_NAMES.get(name, name)
     if name not in LAWS:
         raise InputError(f"unknown follower {name!r}; baselines are {', '.join(LAWS)}")
     return LAWS[name](config)

@@ -171,7 +171,6 @@ def test_who_knows_of_a_failure_holds_it() -> None:
 
 def test_with_a_known_failure_the_plan_is_at_once_for_those_that_are_left() -> None:
     law = make_law("lqg-known-failures", STRONG)
-    assert type(make_law("lqg-told", STRONG)) is type(law)  # its former name
     mass, still, total = np.full(5, 0.6), np.zeros((5, 2)), np.full(5, 6.9)
     observation = np.zeros((5, 18))
     whole, less = np.ones((5, 6)), np.ones((5, 6))
