@@ -6,16 +6,8 @@ from dataclasses import replace
 
 from mjxball.config._learning import Sac
 from mjxball.config._plant_file import read_plant
-from mjxball.config._settings import (
-    Bounds,
-    Command,
-    Config,
-    Follower,
-    Leader,
-    Reward,
-    ScenarioRanges,
-    Timing,
-)
+from mjxball.config._scenario import ScenarioRanges
+from mjxball.config._settings import Bounds, Command, Config, Follower, Leader, Reward, Timing
 from mjxball.config._tree import apply_overrides
 
 PAIR = replace(

@@ -1,7 +1,6 @@
 """Settings of the learning algorithms; the name of each section is that of `train.py --algorithm`."""
 
-from __future__ import annotations
-
+# Without `from __future__ import annotations`: the type of a field is read, and is no text.
 from dataclasses import dataclass
 
 from mjxball.config._leaf import setting

@@ -1,7 +1,6 @@
 """The plant's settings: drones fixed to a carrier, and the load that moves on it. SI units, body axes about O."""
 
-from __future__ import annotations
-
+# Without `from __future__ import annotations`: the type of a field is read, and is no text.
 from dataclasses import dataclass
 from typing import Literal
 

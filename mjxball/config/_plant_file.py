@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config._load import follow_plant
 from mjxball.config._model import Told, read_model
 from mjxball.config._model_plant import plant_of
 from mjxball.config._model_source import MODELS
 from mjxball.config._plant import Plant
 from mjxball.config._settings import Config
-from mjxball.config._tree import apply_overrides, leaves, override
-from mjxball.config._validate import MOST_DRONES, check_leaves, validate
+from mjxball.config._tree import apply_overrides, leaves, override, replace
+from mjxball.config._validate import MOST_DRONES, ball_limit, cg_limit, check_leaves, validate
 from mjxball.errors import InputError
 from mjxball.files import MissingFileError, read_text
 from mjxball.reading import parse_json, parse_toml
@@ -24,6 +23,12 @@ PLANT_PARTS = ("plant", "attitude", "autopilot", "leader", "scenario", "motion")
 SHIPPED = Path(__file__).parent / "plants"
 PLANTS = tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))  # names that `--plant` takes
 DRONES = "plant.drones"
+MASSES = (  # in proportion to the object's
+    "scenario.object_mass",
+    "scenario.unknown_mass",
+    "scenario.mass_change",
+    "attitude.design_object_mass",
+)
 MAX_PLANT = 2**16  # bytes of a plant file; TOML of thousands of drones takes minutes to read
 
 
@@ -143,6 +148,28 @@ def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
             yield from _flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
+
+
+def follow_plant(config: Config, before: Plant, said: Collection[str]) -> Config:
+    """`config`, whose plant was `before`, with a load that fits its plant now; settings in `said` (paths) stay.
+
+    Masses scale with `plant.object_mass`. Largest offsets of the CG and of a rolling ball are limited to the object.
+    """
+    factor = config.plant.object_mass / before.object_mass
+    known = {path: value for path, value, _ in leaves(config)}
+    for path in MASSES if factor != 1 else ():
+        if path not in said:
+            value = known[path]
+            scaled = tuple(factor * one for one in value) if isinstance(value, tuple) else factor * value
+            config = replace(config, path, scaled)
+    if config.plant == before:
+        return config
+    if "scenario.cg_amplitude" not in said:
+        low, high = (min(one, cg_limit(config.plant)) for one in config.scenario.cg_amplitude)
+        config = replace(config, "scenario.cg_amplitude", (low, high))
+    if "scenario.ball_start" not in said:
+        config = replace(config, "scenario.ball_start", min(config.scenario.ball_start, ball_limit(config.plant)))
+    return config
 
 
 def _check_inertias(plant: Plant) -> None:

@@ -8,8 +8,8 @@ from dataclasses import replace
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant_file import read_plant
-from mjxball.config._rigs import Rigs
-from mjxball.config._settings import Attitude, Bounds, Command, Config, Follower, Reward, ScenarioRanges
+from mjxball.config._scenario import Rigs, ScenarioRanges
+from mjxball.config._settings import Attitude, Bounds, Command, Config, Follower, Reward
 from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 

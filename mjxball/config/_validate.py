@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
 import typing
@@ -19,36 +18,35 @@ from mjxball.reading import SMALLEST, is_number, shown
 MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
 
 
-@functools.cache
-def _types_of(kind: Any) -> dict[str, Any]:
-    return typing.get_type_hints(kind)
+def check_leaves(config: Config) -> None:
+    """Raise InputError unless every setting has its type and lies within its bounds."""
+    for path, value, item in leaves(config):
+        _check_leaf(path, value, item)
 
 
-def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> None:
-    if typing.get_origin(hint) is Literal:
-        if value not in typing.get_args(hint):
-            allowed = " or ".join(str(choice) for choice in typing.get_args(hint))
-            raise InputError(f"{path} must be {allowed}, not {shown(value)}")
-        return
-    if hint is bool:
+def _check_leaf(path: str, value: Any, item: dataclasses.Field) -> None:
+    kind: Any = item.type
+    kinds = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        if value not in kinds:
+            raise InputError(f"{path} must be {' or '.join(kinds)}, not {shown(value)}")
+    elif kind is bool:
         if not isinstance(value, bool):
             raise InputError(f"{path} must be true or false, not {shown(value)}")
-        return
-    if typing.get_origin(hint) is not tuple:
-        _check_number(path, value, hint, item.metadata)
-        return
-    kinds = typing.get_args(hint)
-    if not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
+    elif typing.get_origin(kind) is not tuple:
+        _check_number(path, value, kind, item.metadata)
+    elif not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
         count = "several" if Ellipsis in kinds else str(len(kinds))
         raise InputError(f"{path} takes {count} numbers, not {shown(value)}")
-    if not value and item.default:
+    elif not value and item.default:
         raise InputError(f"{path} must hold at least one number")
-    if len(value) > item.metadata["most"]:
+    elif len(value) > item.metadata["most"]:
         raise InputError(f"{path} takes at most {item.metadata['most']:,} numbers, not {len(value):,}")
-    for number in value:
-        _check_number(path, number, kinds[0], item.metadata)
-    if item.metadata["ordered"] and value[0] > value[1]:
-        raise InputError(f"{path} must be low,high with low <= high, not {value[0]:g},{value[1]:g}")
+    else:
+        for number in value:
+            _check_number(path, number, kinds[0], item.metadata)
+        if item.metadata["ordered"] and value[0] > value[1]:
+            raise InputError(f"{path} must be low,high with low <= high, not {value[0]:g},{value[1]:g}")
 
 
 def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
@@ -59,16 +57,6 @@ def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
         raise InputError(f"{path} must be between {bounds['low']:g} and {bounds['high']:g}, not {shown(number)}")
     if not is_number(number):
         raise InputError(f"{path} must be 0 or at least {SMALLEST:g} in size, not {shown(number)}")
-
-
-def check_leaves(config: Config) -> None:
-    """Raise InputError unless every setting is of its type and within its own bounds."""
-    for path, value, item in leaves(config):
-        owner: Any = config
-        for part in path.split(".")[:-1]:
-            owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
-        kind: Any = type(owner)  # hashable, which no type checker knows of `type[Any]`
-        _check_leaf(path, value, item, _types_of(kind)[item.name])
 
 
 def validate(config: Config) -> Config:
