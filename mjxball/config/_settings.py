@@ -1,4 +1,4 @@
-"""Every setting: frozen dataclasses whose leaves carry their help text and bounds. SI units throughout."""
+"""The configuration: frozen dataclasses whose fields carry their help text and bounds. SI units."""
 
 # Without `from __future__ import annotations`: the type of a field is read, and is no text.
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Autopilot:
-    """What each drone's own computer runs. `ideal` is the PD loop of `Attitude`; `crazyflie` is its firmware's
-    cascade, with the gains kp, ki, kd of its parameters pid_attitude.* and pid_rate.*, defaults as delivered.
+    """The autopilot of each drone. `ideal` is the PD loop of `Attitude`; `crazyflie` is the cascade of that firmware,
+    with the gains kp, ki, kd of its parameters pid_attitude.* and pid_rate.* and its defaults.
     """
 
     kind: Literal["ideal", "crazyflie"] = setting("ideal", "ideal: PD of `attitude`; crazyflie: the firmware's cascade")
@@ -37,7 +37,10 @@ class Autopilot:
     pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0, high=1e6)
     yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0, high=1e6)
     follower_ki_scale: float = setting(
-        1.0, "factor on the follower's ki: two drones that integrate on one body work against each other", low=0, high=1
+        1.0,
+        "factor on the follower's ki: on one body the integrals of two drones work against each other",
+        low=0,
+        high=1,
     )
     motor_curve: Range = setting(
         (0.0915, 0.0677),
@@ -46,46 +49,51 @@ class Autopilot:
         high=1000,
     )
     drone: Literal["", "2.1", "2.1-legacy", "thrust-upgrade", "brushless"] = setting(
-        "", "whose motors follow the battery where scenario.battery is drawn; empty: unknown, they follow the curve"
+        "", "the drone, for the effect of scenario.battery on its motors; empty: unknown, motors follow the curve"
     )
     thrust_law: Literal["calibrated", "paper"] = setting(
         "calibrated", "calibrated: the motor curve at m (g + az); paper: hover_thrust + thrust_per_acceleration az"
     )
-    hover_thrust: float = setting(46000.0, "thr_hov of the paper's law, calibrated for each rig", low=0, high=60_000)
-    thrust_per_acceleration: float = setting(1000.0, "k_pz of the paper's law [1/(m/s2)]", low=0, high=60_000)
+    hover_thrust: float = setting(
+        46000.0, "thr_hov of the paper's thrust command, calibrated for each rig", low=0, high=60_000
+    )
+    thrust_per_acceleration: float = setting(
+        1000.0, "k_pz of the paper's thrust command [1/(m/s2)]", low=0, high=60_000
+    )
 
 
 @dataclass(frozen=True)
 class Leader:
-    """The leader's PID law (paper eq. 5) and its command limits."""
+    """The leader's PID controller (paper eq. 5)."""
 
     kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0, high=1e6)
     kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0, high=1e6)
     ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0, high=1e6)
     integral_error_limit: Vector3 = setting(
-        (1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", low=1e-6, high=1e12
+        (1e3, 1e3, 1e3), "largest error per axis that enters the integral [m]", low=1e-6, high=1e12
     )
     integral_lead_time: float = setting(
         0.0,
-        "the integrated error is error + this * its rate, within the limit: nothing winds up on the way to a goal [s]",
+        "the integral is of error + this * its rate, within the limit: it does not wind up on the way to a goal [s]",
         low=0,
         high=1000,
     )
     tilt_integral_gain: float = setting(
         0.0,
-        "difference of both drones' lift for the time integral of the carrier's tilt error about the axis that "
-        "the load turns, with follower.residual_on_pid [m/s2 per rad s]",
+        "difference of both drones' vertical acceleration per time integral of the carrier's tilt error about the axis "
+        "of the load's torque, with follower.residual_on_pid [m/s2 per rad s]",
         low=0,
         high=1e4,
     )
     error: Literal["object", "own"] = setting(
-        "object", "what it flies on: e_o of the object, or e_l of its own place, goal + its mount (the paper's stand)"
+        "object",
+        "the error it controls: e_o of the object, or e_l of its own position, goal + its mount (paper's stand)",
     )
 
 
 @dataclass(frozen=True)
 class Command:
-    """Limits of what any drone is sent, leader or follower."""
+    """Limits of the command to any drone, leader or follower."""
 
     tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", low=1e-6, high=1.2)
     vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", low=1e-6, high=1e6)
@@ -93,37 +101,37 @@ class Command:
 
 @dataclass(frozen=True)
 class Follower:
-    """What the follower sees and what it commands."""
+    """The follower's observation and command."""
 
     action: Literal["residual", "direct"] = setting(
-        "residual", "residual: added to the PD law on its own observation; direct: the command itself"
+        "residual", "residual: added to a PD controller on its own observation; direct: the command itself"
     )
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", low=1e-9, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", low=1e-9, high=1e6)
     residual_on_pid: bool = setting(
         False,
-        "a residual action is added to the leader's PID law, integrals included, not to its PD part alone, behind a "
-        "high pass: what lasts is the integrals' part",
+        "a residual action passes a high-pass filter and is added to the leader's PID controller with its integrals, "
+        "not to its PD part: the integrals make up for lasting loads",
     )
     load_axis_only: bool = setting(
         False,
-        "of roll and pitch the network commands the one that the load turns; the other follows the PD law or is 0",
+        "the network commands roll or pitch, whichever the load's torque turns; the other is the PD controller's or 0",
     )
     error: Literal["object", "leader"] = setting(
-        "object", "what the slots of the object's error carry: e_o, or the leader's e_l"
+        "object", "the error in the observation: e_o of the object, or the leader's e_l"
     )
-    ignore_position: bool = setting(True, "the network does not see the absolute position")
-    previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
+    ignore_position: bool = setting(True, "the network does not observe the absolute position")
+    previous_action: bool = setting(False, "the network also observes its last action, scaled to -1 to 1")
     observation_averages: tuple[float, ...] = setting(
         (),
-        "time constants of exponential averages of observations and actions that the network sees [s]",
+        "time constants of exponential averages of observations and actions that the network observes [s]",
         low=0.001,
         high=1e6,
     )
-    recurrent_units: int = setting(
-        0, "units of a GRU whose state the network carries from step to step; 0: none", low=0, high=512
+    recurrent_units: int = setting(0, "units of the network's GRU; 0: none", low=0, high=512)
+    privileged_critic: bool = setting(
+        False, "in training, critics also observe the CG, the true mass and the disturbances"
     )
-    privileged_critic: bool = setting(False, "in training, critics also see the CG, the true mass and the disturbances")
 
 
 @dataclass(frozen=True)
@@ -131,18 +139,18 @@ class Timing:
     """Clock rates."""
 
     control_period: float = setting(0.02, "time between two commands [s]", low=0.001, high=1)
-    physics_steps: int = setting(4, "physics and attitude-loop steps in a control period", low=1, high=1000)
+    physics_steps: int = setting(4, "steps of physics and attitude loop in a control period", low=1, high=1000)
     episode_steps: int = setting(1000, "control steps of a training episode, then truncated", low=1, high=10**6)
 
 
 @dataclass(frozen=True)
 class Reward:
-    """Reward of one control step. `paper` mimics the leader; `task` (ours) scores what the user wants."""
+    """Reward of one control step. `paper` rewards imitation of the leader, `task` (ours) balance at the goal."""
 
-    kind: Literal["paper", "task"] = setting("task", "paper (leader mimicry) or task (balance)")
-    error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0, high=1e9)
+    kind: Literal["paper", "task"] = setting("task", "paper (imitation of the leader) or task (balance)")
+    error: float = setting(1.0, "weight of |e_o| over error_scale [1]", low=0, high=1e9)
     error_scale: float = setting(
-        0.1, "|e_o| at which the error's cost turns from square to linear [m]", low=1e-9, high=1e6
+        0.1, "|e_o| up to which the cost of the error is quadratic, beyond it linear [m]", low=1e-9, high=1e6
     )
     velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0, high=1e9)
     tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0, high=1e9)
@@ -155,44 +163,46 @@ class Reward:
         low=0,
         high=1e9,
     )
-    ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0, high=1e9)
+    ball: float = setting(
+        0.0, "weight of the squared offset of a rolling ball over that of its end stop", low=0, high=1e9
+    )
     steady_action: float = setting(
         0.0,
-        "weight of the squared slowest average of the network action: what stands is the integrals' part",
+        "weight of the squared slowest average of the network action: lasting loads are left to the integrals",
         low=0,
         high=1e9,
     )
     tilt_disagreement: float = setting(
         0.0,
-        "weight of the squared difference of both drones' tilt commands about the axis that no load turns",
+        "weight of the squared difference of both drones' tilt commands about the axis without a torque of the load",
         low=0,
         high=1e9,
     )
     spread: float = setting(
         0.0,
         "weight of the squared differences of a follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command to "
-        "the mean of all followers: they are not to work against each other",
+        "the mean of all followers",
         low=0,
         high=1e9,
     )
-    termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0, high=1e9)
+    termination: float = setting(50.0, "cost of a termination", low=0, high=1e9)
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What `eval.py --check` enforces for the exported policy on the reference scenario; 0 leaves a metric free."""
+    """Bounds of the exported policy on the reference scenario, for `eval.py --check`; 0: no bound."""
 
     x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0, high=1e12)
     settling_time: float = setting(4.0, "2 % settling time [s]", low=0, high=1e12)
     rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", low=0, high=1e12)
     action_error: float = setting(
-        0.0, "rms of the command less the leader's, over all three [rad, m/s2]", low=0, high=1e12
+        0.0, "rms of the difference to the leader's command, over all three [rad, m/s2]", low=0, high=1e12
     )
 
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that determines a run, its seed aside."""
+    """Everything that determines a run, besides its seed."""
 
     preset: str = "paper"
     plant: Plant = Plant()
@@ -213,5 +223,5 @@ class Config:
 
     @property
     def physics_step(self) -> float:
-        """Time of one physics step [s]."""
+        """Duration of one physics step [s]."""
         return self.timing.control_period / self.timing.physics_steps
