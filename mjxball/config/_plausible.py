@@ -1,4 +1,4 @@
-"""Refuse plants whose proportions no rig has: one of their numbers is probably in another unit."""
+"""Refuse plants with implausible proportions, where a number is probably in a wrong unit."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
 
-MOST_THRUST = 100.0  # times the weight; racing drones have 15
-WRONG_UNIT = 0.5  # below it a plant is not only too weak
-MOST_GRAVITY = 30.0  # [m/s2], a little more than Jupiter's
-YAW_OF_ARM = 10.0  # yaw torque per thrust over the arm; shipped plants have 0.13 to 0.17
-LONGEST_LAG = 1.0  # [s] of any rotor
+MOST_THRUST = 100.0  # thrust over weight; racing drones have 15
+WRONG_UNIT = 0.5  # thrust over weight below which a wrong unit is likelier than a weak plant
+MOST_GRAVITY = 30.0  # [m/s2]; Jupiter has 25
+YAW_OF_ARM = 10.0  # yaw moment per force over the arm; shipped plants have 0.13 to 0.17
+LONGEST_LAG = 1.0  # time constant of a rotor [s]
 ARM_OF_SPACING = 1.0  # arm over the distance to the nearest drone; shipped plants have 0.15 to 0.43
 GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0.4 to 0.9
 CARRIER_OF_REACH = 3.0  # the carrier's radius of gyration over its own reach; shipped plants have 0.5
 SIZE_OF_REACH = 20.0  # longest edge of the object over the farthest mount; shipped plants have 1 to 2
-LONGEST_ERROR = 20.0  # [s] time constant of the slowest pole under the leader's law; shipped presets have 0.6 to 3
-FASTEST = 0.5  # natural frequency times physics step, beyond which the sampled loop has too little phase
+LONGEST_ERROR = 20.0  # time constant of the leader's slowest pole [s]; shipped presets have 0.6 to 3
+FASTEST = 0.5  # natural frequency times physics step; beyond it sampling takes too much phase
 
 
 def thrust_over_weight(plant: Plant, object_mass: float | None = None) -> float:
-    """Largest force of all rotors over the weight of all, with the plant's object or one of `object_mass` [kg]."""
+    """Largest force of all rotors over the weight, with the plant's object or one of `object_mass` [kg]."""
     force = 4 * sum(plant.of_drones("rotor_force_max"))
     return force / (plant.gravity * total_mass(plant, object_mass))
 
@@ -38,11 +38,11 @@ def total_mass(plant: Plant, object_mass: float | None = None) -> float:
 
 
 def check_units(config: Config) -> None:
-    """Raise InputError for proportions that no rig has; the sentence says which unit was probably meant.
+    """Raise InputError for implausible proportions; the sentence names the unit that was probably meant.
 
-    Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw torque over arm, object over
-    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the loop
-    that the leader's law closes around it.
+    Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw moment over arm, object over
+    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the
+    stability of the leader's position loop.
     """
     plant = config.plant
     if plant.gravity > MOST_GRAVITY:
@@ -59,7 +59,7 @@ def check_units(config: Config) -> None:
 
 
 def _meant(value: float, unit: str, base: str, cured: bool = True) -> str:
-    """What `value` would be if it were given in thousandths of `base`; nothing if that would not be `cured`."""
+    """The hint that `value` was given in thousandths of `base`; empty unless that would be `cured`."""
     return f"; {value:g} {unit} would be {value / 1000:g} {base}" if cured else ""
 
 
@@ -97,13 +97,13 @@ def _check_lags(plant: Plant) -> None:
 
 
 def _check_weight(config: Config) -> None:
-    """A plant lifts its own object and the heaviest that is drawn."""
+    """The plant lifts its own object and the heaviest that the scenario samples."""
     for mass in (config.plant.object_mass, config.scenario.object_mass[1]):
         check_lift(config, mass)
 
 
 def check_lift(config: Config, mass: float) -> None:
-    """Raise InputError unless the plant lifts an object of `mass` [kg]; on a pivot nothing is lifted."""
+    """Raise InputError unless the plant lifts an object of `mass` [kg], or stands on a pivot."""
     plant, force = config.plant, 4 * sum(config.plant.of_drones("rotor_force_max"))
     if plant.stand == "pivot":
         return
@@ -118,7 +118,7 @@ def check_lift(config: Config, mass: float) -> None:
 
 
 def _stronger(plant: Plant, mass: float) -> Iterator[str]:
-    """Which masses were probably given in grams, or forces in kN: those that alone in SI units let the plant fly."""
+    """Hints at masses in grams or forces in kN: each change of units by which alone the plant would fly."""
     light = replace(plant, drones=tuple(replace(drone, mass=drone.mass / 1000) for drone in plant.drones))
     heaviest, force = max(drone.mass for drone in plant.drones), max(plant.of_drones("rotor_force_max"))
     sound = all(_gyrates(drone, arm) for drone, arm in zip(light.drones, light.of_drones("arm"), strict=True))
@@ -164,7 +164,7 @@ def _check_inertia(plant: Plant) -> None:
 
 
 def _check_carrier(plant: Plant) -> None:
-    """The carrier's mass is not farther out than the farthest mount or edge, with some to spare."""
+    """The carrier's radius of gyration is not much larger than the distance of its farthest mount or edge."""
     if not plant.carrier_mass:
         return
     largest, reach = max(plant.carrier_inertia), max(*plant.object_size, *(math.hypot(*d.mount) for d in plant.drones))
@@ -181,7 +181,7 @@ def _check_carrier(plant: Plant) -> None:
 
 
 def _check_loop(config: Config) -> None:
-    """The attitude loop is stable with the rotors' lag, slower than its steps, faster than the leader's loop."""
+    """The attitude loop is stable with the rotors' lag, slow beside its steps, and faster than the leader's loop."""
     loop, lag, step = config.attitude, max(config.plant.of_drones("rotor_lag")), config.physics_step
     slowest = math.sqrt(max(config.leader.kp[:2]))
     for axis, frequency in zip(("roll", "pitch", "yaw"), loop.natural_frequency, strict=True):
@@ -203,16 +203,16 @@ def _check_loop(config: Config) -> None:
 
 
 def _check_leader(config: Config) -> None:
-    """The leader's law and the attitude loop below it are stable together, and forget an error in time.
+    """The leader's position loop around the attitude loop is stable, and errors decay in time.
 
-    Poles of the object that hovers: what a tilt moves it by is gravity's, what thrust lifts it by the rotors'. An
-    integral is slow where it is small: stability counts with it, speed without.
+    Checked are the poles at hover: horizontal motion by gravity's share at a tilt, vertical motion by thrust with the
+    rotors' lag. A small integral gain makes a slow pole, so decay is checked without the integral.
     """
     law, loop, lag = config.leader, config.attitude, max(config.plant.of_drones("rotor_lag"))
     free = config.plant.stand == "free"
     ways = {"x": (0, "pitch"), "y": (1, "roll")} if free else {}
     ways |= {"z": (2, "")} if config.plant.stand != "pivot" else {}
-    slowest = 1 / LONGEST_ERROR if free else 0.0  # the paper's stand sinks back within a minute
+    slowest = 1 / LONGEST_ERROR if free else 0.0  # the paper's stand takes a minute
     for axis, (place, turned) in ways.items():
         bottom: list[float] = [lag, 1.0]
         below = "rotors"

@@ -1,4 +1,4 @@
-"""Refuse configurations that make no sense, in one sentence."""
+"""Validation: types, bounds, and relations between settings. Every refusal is an InputError of one sentence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from mjxball.config._tree import leaves
 from mjxball.errors import InputError
 from mjxball.reading import SMALLEST, is_number, shown
 
-MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
+MOST_DRONES = 16  # of a plant
+FARTHEST = 10.0  # distance of a mount from O [m]
+APART = 1e-3  # least distance of two drones [m]
+THRUST_MARGIN = 0.2  # least share of a Crazyflie's thrust that hovering leaves
 
 
 def check_leaves(config: Config) -> None:
@@ -60,7 +63,7 @@ def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
 
 
 def validate(config: Config) -> Config:
-    """Return `config` if every leaf and every relation between leaves is sound, else raise InputError."""
+    """Return `config` if every setting and every relation between settings is valid, else raise InputError."""
     check_leaves(config)
     _validate_plant(config.plant)
     check_units(config)
@@ -93,9 +96,6 @@ def validate(config: Config) -> Config:
     if config.sac.replay_size % config.sac.num_envs:
         raise InputError("sac.replay_size must be a multiple of sac.num_envs")
     return config
-
-
-APART = 1e-3  # [m] by which two drones' centres must differ
 
 
 def _validate_plant(plant: Plant) -> None:
@@ -138,7 +138,7 @@ def _validate_plant(plant: Plant) -> None:
 
 
 def _validate_team(config: Config) -> None:
-    """What is for teams, and what is for pairs alone."""
+    """Settings that need a team, and those that need a pair."""
     plant, scenario = config.plant, config.scenario
     if config.follower.residual_on_pid and plant.count > 2:
         raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")
@@ -166,11 +166,8 @@ def _validate_team(config: Config) -> None:
         )
 
 
-THRUST_MARGIN = 0.2  # share of a Crazyflie's thrust that a hover must leave
-
-
 def thrust_margin(config: Config) -> float:
-    """Share of the weaker drone's full thrust that hovering the heaviest object leaves; negative: it cannot hover."""
+    """Share of full thrust that hovering with the heaviest object leaves the most loaded drone; negative: too heavy."""
     plant, most = config.plant, 4 * sum(config.autopilot.motor_curve)
     mass = config.scenario.object_mass[1] + max(config.scenario.mass_change[1], 0.0)
     carried = (own + share * mass for own, share in zip(plant.known_masses, plant.load_shares, strict=True))
