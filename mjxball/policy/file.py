@@ -1,4 +1,4 @@
-"""The policy file: one `.npz` without pickles (docs/policy-file.md). Reading verifies everything it uses."""
+"""The policy file: one `.npz` without pickles (docs/policy-file.md). All contents are checked when it is read."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from mjxball.files import write_whole
 from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.reading import is_number, parse_json
 
-# 5: with a GRU below the network, arrays GRU_ARRAYS; if it is told where drones are mounted, with card field `context`.
+# 5: with a GRU (arrays GRU_ARRAYS); with `context` in the metadata its inputs include the geometry of the team.
 FORMAT_VERSIONS = (1, 5)
-ENDED = {  # formats that stood on an LQG with numbers of its own
+ENDED = {  # formats of networks on top of an LQG, whose parameters the file holds
     2: "an LQG of a pair",
     3: "an LQG of one of a team",
     4: "LQGs for attitude loops that nobody knows",
 }
-LAST_VERSION = "0.1.0"  # of mjxball that flies them
+LAST_VERSION = "0.1.0"  # the last of mjxball that flies them
 GRU_ARRAYS = ("gru_kernel", "gru_recurrent", "gru_bias")
 MAX_UNITS = 512
-MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
-FOLDER = "policies"  # of those that come with mjxball
-ARCHIVE = "archive"  # in it: earlier ones, which documents name
-READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
+MAX_NUMBER = 1e6  # size of any number in the metadata and of any weight; larger ones would overflow
+FOLDER = "policies"  # shipped policies
+ARCHIVE = "archive"  # in FOLDER: earlier policies that documents name
+READ_OF_CONFIG = ("leader", "attitude", "reward")  # sections of the configuration that evaluation reads
 MAX_CARD = 2**20  # characters
-# Metrics that a card may bound, all of them the better the smaller.
+# Metrics with bounds in the metadata; of each smaller values are better.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 CARD_FIELDS: dict[str, type] = {
     "format_version": int,
@@ -65,16 +65,16 @@ class PolicyFile:
     """Contents of a policy file."""
 
     weights: tuple[np.ndarray, ...]  # float32, (n_in, n_out) each
-    biases: tuple[np.ndarray, ...]  # float32, (n_out,) each; the last layer gives mean and deviation parameters
+    biases: tuple[np.ndarray, ...]  # float32, (n_out,) each; outputs of the last layer are means, then deviations
     observation_mean: np.ndarray  # (n,) float32
-    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
+    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for an input that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
     gru: tuple[np.ndarray, ...] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
-    """What is around the network of a policy file; `filters` is absent from the first files."""
+    """The controller around the network of a policy file with metadata `card`; the first files have no `filters`."""
     filters = tuple(card.get("filters", ()))
     return FollowerLaw(
         history=ObservationHistory(card["previous_action"], filters, float(card["control_period"])),
@@ -90,7 +90,7 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
-    """Write `policy` to `path` atomically: a reader sees the old file or the whole new one."""
+    """Write `policy` to `path` atomically: a reader sees the old file or the complete new one."""
     check(policy, str(path))
     arrays: dict[str, Any] = {
         "observation_mean": policy.observation_mean,
@@ -108,7 +108,7 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
 
 
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:
-    """Read and verify a policy file; raise PolicyFileError with one sentence on anything unsound."""
+    """Read and check a policy file; raise PolicyFileError for anything invalid."""
     name = str(path)
     try:
         arrays = read_arrays(name)
@@ -123,7 +123,7 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
             )
             raise PolicyFileError(f"{name} is not a policy file: it has no {needed}{foreign}")
     card = _read_card(name, arrays.pop("card"))
-    _check_version(card, name)  # before the arrays, which later formats may have others of
+    _check_version(card, name)  # before the arrays, which may differ in later formats
     layers = 0
     while f"weight_{layers}" in arrays:
         layers += 1
@@ -148,10 +148,10 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
 
 
 def load_network(path: str | os.PathLike[str]) -> Network:
-    """The network in `policy.npz` of a run on an environment of one's own.
+    """The network in `policy.npz` of a run on another environment (`--env`).
 
-    It answers observations (..., n) of float32 with actions (..., a) in [-1, 1]. Raises PolicyFileError if the file
-    holds no such network.
+    It maps observations (..., n) of float32 to actions (..., a) in [-1, 1]. Raises PolicyFileError if the file holds no
+    such network.
     """
     arrays = read_arrays(str(path))
     layers = sum(name.startswith("weight_") for name in arrays)
@@ -159,7 +159,7 @@ def load_network(path: str | os.PathLike[str]) -> Network:
         weights = [arrays[f"weight_{number}"] for number in range(layers)]
         biases = [arrays[f"bias_{number}"] for number in range(layers)]
         mean, scale = arrays["observation_mean"], arrays["observation_scale"]
-        half = len(biases[-1]) // 2  # the other one is of the deviation
+        half = len(biases[-1]) // 2  # the other half is the deviation
         found = Network([*weights[:-1], weights[-1][:, :half]], [*biases[:-1], biases[-1][:half]], mean, scale)
         found(np.zeros_like(mean))
     except (KeyError, IndexError, TypeError, ValueError):
@@ -170,7 +170,7 @@ def load_network(path: str | os.PathLike[str]) -> Network:
 def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.ndim != 0 or text.dtype.kind != "U":
         raise PolicyFileError(f"{name}: the card is not one string")
-    if text.dtype.itemsize > 4 * MAX_CARD:  # JSON takes fifty times its own length in memory
+    if text.dtype.itemsize > 4 * MAX_CARD:  # parsed JSON takes fifty times as much memory
         raise PolicyFileError(f"{name}: the card is longer than {MAX_CARD} characters")
     try:
         card = parse_json(str(text))
@@ -182,7 +182,7 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 
 
 def check(policy: PolicyFile, name: str) -> None:
-    """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
+    """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is valid."""
     _check_card(policy.card, name)
     law = law_of(policy.card)
     size = law.input_size
@@ -294,7 +294,7 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
 
 
 def _check_geometry(card: dict[str, Any], name: str) -> None:
-    """Raise PolicyFileError unless a policy that is told where drones are mounted names what it can be told."""
+    """Check `context` and `team` in the metadata of a policy whose inputs include the geometry of its team."""
     if card["format_version"] != 5 or "context" not in card:
         return
     if card["context"] != list(GEOMETRY):
@@ -304,7 +304,7 @@ def _check_geometry(card: dict[str, Any], name: str) -> None:
 
 
 def _check_team(team: Any, name: str) -> None:
-    """Raise PolicyFileError unless `team` says in which team, and as which of its drones, a policy flies."""
+    """Raise PolicyFileError unless `team` holds the geometry of a team and one of its drones."""
     if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
         raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
     if not (is_finite(team["drone"]) and is_finite(team["mount_angle"])):
@@ -318,12 +318,12 @@ def _check_team(team: Any, name: str) -> None:
 
 
 def is_finite(value: Any) -> bool:
-    """Whether `value` of a card is one number within bounds, no truth value."""
+    """Whether `value` is a number (no bool) of at most `MAX_NUMBER` in size."""
     return is_number(value, MAX_NUMBER)
 
 
 def _check_flown(flown: Any, name: str) -> None:
-    """`flown`, if a card has it: the numbers of drones and the seconds up to which flights were found good."""
+    """Check `flown`, if present: numbers of drones, and the duration [s] up to which flights were good."""
     if flown is None:
         return
     fields: dict[str, Any] = flown if isinstance(flown, dict) else {}
@@ -334,12 +334,12 @@ def _check_flown(flown: Any, name: str) -> None:
 
 
 def shipped_policies() -> list[Path]:
-    """The policy files that come with mjxball, by name, without the archived ones; empty if there are none."""
+    """Paths of the shipped policies by name, without archived ones; empty if none are installed."""
     return sorted(_folder().glob("*.npz"))
 
 
 def shipped_policy(name: str) -> Path:
-    """The shipped file called `name`, such as `balance`, archived ones too; raise InputError if there is none."""
+    """The path of the shipped or archived policy `name`, such as `balance`; InputError if there is none."""
     known = _shipped()
     if name not in known:
         raise InputError(f"no shipped policy is called {name!r}; there are {', '.join(known) or 'none'}")
@@ -347,7 +347,7 @@ def shipped_policy(name: str) -> Path:
 
 
 def policy_path(text: str | os.PathLike[str]) -> Path:
-    """The path that `text` names: what exists there, else the shipped policy of that name, else `text` itself."""
+    """`text` as a path if that exists, else the path of the shipped policy of that name, else `text` as a path."""
     path = Path(text)
     return path if os.path.lexists(path) else _shipped().get(str(text), path)
 
@@ -357,6 +357,6 @@ def _shipped() -> dict[str, Path]:
 
 
 def _folder() -> Path:
-    """A wheel carries them inside the package; a source tree and an editable install have them beside it."""
+    """The folder of shipped policies: inside the package in a wheel, beside it in a source tree."""
     packaged = Path(str(resources.files("mjxball"))) / FOLDER
     return packaged if packaged.is_dir() else Path(__file__).parents[2] / FOLDER
