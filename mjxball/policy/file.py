@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -39,25 +40,14 @@ MAX_CARD = 2**20  # characters
 # Metrics with bounds in the metadata; of each smaller values are better.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 CARD_FIELDS: dict[str, type] = {
-    "format_version": int,
-    "observation": list,
-    "history": int,
+    **dict.fromkeys(("format_version", "history", "training_steps"), int),
+    **dict.fromkeys(("gravity", "control_period"), float),
     "previous_action": bool,
-    "action": list,
-    "action_mode": str,
-    "action_reach": list,
-    "command_limits": list,
-    "leader_kp": list,
-    "leader_kd": list,
-    "gravity": float,
-    "control_period": float,
-    "plant": dict,
-    "preset": str,
-    "config_hash": str,
-    "package_version": str,
-    "training_steps": int,
-    "bounds": dict,
+    **dict.fromkeys(("action_mode", "preset", "config_hash", "package_version"), str),
+    **dict.fromkeys(("observation", "action", "action_reach", "command_limits", "leader_kp", "leader_kd"), list),
+    **dict.fromkeys(("plant", "bounds"), dict),
 }
+LENGTHS = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
 
 
 @dataclass(frozen=True)
@@ -247,90 +237,86 @@ def _check_version(card: dict[str, Any], name: str) -> None:
 
 def _check_card(card: dict[str, Any], name: str) -> None:
     _check_version(card, name)
+    for fault in _card_faults(card):
+        raise PolicyFileError(f"{name}: {fault}")
+
+
+def _card_faults(card: dict[str, Any]) -> Iterator[str]:
+    """Phrases on what is wrong with the metadata of a policy; after the first one others need not be right."""
     for field, kind in CARD_FIELDS.items():
         value = card.get(field)
-        if isinstance(value, bool) and kind is not bool:
-            value = None
-        if not isinstance(value, (int, float) if kind is float else kind):
-            raise PolicyFileError(f"{name}: card field {field} is missing or not {kind.__name__}")
+        kinds = (int, float) if kind is float else kind
+        if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
+            yield f"card field {field} is missing or not {kind.__name__}"
     if card["observation"] != [list(slot) for slot in OBSERVATION]:
-        raise PolicyFileError(f"{name} was made for another observation than this version's 18 numbers")
+        yield "the policy was made for another observation than this version's 18 numbers"
     if card["action"] != [list(slot) for slot in ACTION]:
-        raise PolicyFileError(f"{name} was made for another action than roll, pitch, vertical acceleration")
+        yield "the policy was made for another action than roll, pitch, vertical acceleration"
     config = card.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
-        raise PolicyFileError(f"{name}: card field config is not a configuration")
-    _check_card_numbers(card, name)
+        yield "card field config is not a configuration"
+    yield from _number_faults(card)
+    if card["format_version"] == 5 and "context" in card:
+        yield from _geometry_faults(card)
+    if card.get("flown") is not None:
+        yield from _flown_faults(card["flown"])
 
 
-def _check_card_numbers(card: dict[str, Any], name: str) -> None:
+def _number_faults(card: dict[str, Any]) -> Iterator[str]:
+    """Of fields that have the right types."""
     if card["action_mode"] not in ("residual", "direct"):
-        raise PolicyFileError(f"{name}: action_mode must be residual or direct, not {card['action_mode']!r}")
+        yield f"action_mode must be residual or direct, not {card['action_mode']!r}"
     if card["history"] != 1:
-        raise PolicyFileError(f"{name}: history must be 1, not {card['history']}; more of it mjxball 0.1.0 flies")
+        yield f"history must be 1, not {card['history']}; more of it mjxball {LAST_VERSION} flies"
     filters = card.get("filters", [])
     if not isinstance(filters, list) or len(filters) > 10 or not all(is_finite(t) and t >= 1e-3 for t in filters):
-        raise PolicyFileError(f"{name}: filters must be up to 10 time constants of at least 1 ms")
-    lengths = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
-    for field, length in lengths.items():
-        numbers = card[field]
-        if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
-            raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
-    _check_geometry(card, name)
-    _check_flown(card.get("flown"), name)
+        yield "filters must be up to 10 time constants of at least 1 ms"
+    for field, length in LENGTHS.items():
+        if len(card[field]) != length or not all(is_finite(value) and value >= 0 for value in card[field]):
+            yield f"card field {field} must be {length} finite numbers"
     units, most = card.get("recurrent_units", 0), MAX_UNITS if card["format_version"] == 5 else 0
     if type(units) is not int or not min(most, 1) <= units <= most:
-        raise PolicyFileError(
-            f"{name}: card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
-        )
+        yield f"card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
     for field in ("control_period", "gravity"):
         if not (is_finite(card[field]) and card[field] >= 1e-6):
-            raise PolicyFileError(f"{name}: card field {field} must be positive")
-    if not all(is_finite(value) for value in card["bounds"].values()):
-        raise PolicyFileError(f"{name}: card field bounds must hold finite numbers")
-    odd = sorted(set(card["bounds"]) - set(BOUNDED))
-    if odd:
-        raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
+            yield f"card field {field} must be positive"
+    if not all(map(is_finite, card["bounds"].values())):
+        yield "card field bounds must hold finite numbers"
+    for odd in sorted(set(card["bounds"]) - set(BOUNDED)):
+        yield f"card field bounds names {odd!r}; known are {', '.join(BOUNDED)}"
 
 
-def _check_geometry(card: dict[str, Any], name: str) -> None:
-    """Check `context` and `team` in the metadata of a policy whose inputs include the geometry of its team."""
-    if card["format_version"] != 5 or "context" not in card:
-        return
+def _geometry_faults(card: dict[str, Any]) -> Iterator[str]:
+    """Of `context`, and of `team`: the geometry of a team as one of its drones sees it."""
     if card["context"] != list(GEOMETRY):
-        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(GEOMETRY)}")
-    if "team" in card:
-        _check_team(card["team"], name)
-
-
-def _check_team(team: Any, name: str) -> None:
-    """Raise PolicyFileError unless `team` holds the geometry of a team and one of its drones."""
+        yield f"the policy needs another context than this version's {', '.join(GEOMETRY)}"
+    if "team" not in card:
+        return
+    team = card["team"]
     if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
-        raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
+        yield "card field team must hold drone, mount_angle and context"
     if not (is_finite(team["drone"]) and is_finite(team["mount_angle"])):
-        raise PolicyFileError(f"{name}: card fields team.drone and team.mount_angle must be finite numbers")
+        yield "card fields team.drone and team.mount_angle must be finite numbers"
     context = team["context"]
     if not (isinstance(context, list) and len(context) == len(GEOMETRY) and all(map(is_finite, context))):
-        raise PolicyFileError(f"{name}: card field team.context must be {len(GEOMETRY)} finite numbers")
+        yield f"card field team.context must be {len(GEOMETRY)} finite numbers"
     share, _, _, room = context
     if share <= 1 or room <= 0:
-        raise PolicyFileError(f"{name}: card field team.context: command_share must be above 1 and rotor_room positive")
+        yield "card field team.context: command_share must be above 1 and rotor_room positive"
+
+
+def _flown_faults(flown: Any) -> Iterator[str]:
+    """Of `flown`: numbers of drones, and the duration [s] up to which flights were good."""
+    fields: dict[str, Any] = flown if isinstance(flown, dict) else {}
+    drones, seconds = fields.get("drones"), fields.get("seconds", 0.0)
+    counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
+    if not (counts and is_finite(seconds) and seconds > 0):
+        yield "card field flown must hold drones, numbers above 1, and positive seconds"
 
 
 def is_finite(value: Any) -> bool:
     """Whether `value` is a number (no bool) of at most `MAX_NUMBER` in size."""
     return is_number(value, MAX_NUMBER)
-
-
-def _check_flown(flown: Any, name: str) -> None:
-    """Check `flown`, if present: numbers of drones, and the duration [s] up to which flights were good."""
-    if flown is None:
-        return
-    fields: dict[str, Any] = flown if isinstance(flown, dict) else {}
-    drones, seconds = fields.get("drones"), fields.get("seconds", 0.0)
-    counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
-    if not (counts and is_finite(seconds) and seconds > 0):
-        raise PolicyFileError(f"{name}: card field flown must hold drones, numbers above 1, and positive seconds")
 
 
 def shipped_policies() -> list[Path]:
