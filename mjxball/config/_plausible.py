@@ -22,6 +22,7 @@ GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0
 CARRIER_OF_REACH = 3.0  # the carrier's radius of gyration over its own reach; shipped plants have 0.5
 SIZE_OF_REACH = 20.0  # longest edge of the object over the farthest mount; shipped plants have 1 to 2
 LONGEST_ERROR = 20.0  # time constant of the leader's slowest pole [s]; shipped presets have 0.6 to 3
+INERTIA_UNITS = {"g mm2": 1e-9, "g cm2": 1e-7, "kg mm2": 1e-6, "g m2": 1e-3}  # [kg m2]
 FASTEST = 0.5  # natural frequency times physics step; beyond it sampling takes too much phase
 
 
@@ -63,37 +64,29 @@ def _meant(value: float, unit: str, base: str, cured: bool = True) -> str:
     return f"; {value:g} {unit} would be {value / 1000:g} {base}" if cured else ""
 
 
+def _refuse_above(most: float, value: float, unit: str, name: str, what: str) -> None:
+    """Raise InputError, with a hint at thousandths of `unit`, if `value` is more than `most`."""
+    if value > most:
+        raise InputError(f"{name} {value:g} {unit} is {what}{_meant(value, f'm{unit}', unit, value / 1000 <= most)}")
+
+
 def _check_sizes(plant: Plant) -> None:
-    mounts = [drone.mount for drone in plant.drones]
-    for number, (arm, mount) in enumerate(zip(plant.of_drones("arm"), mounts, strict=True)):
+    mounts, arms = [drone.mount for drone in plant.drones], plant.of_drones("arm")
+    for number, (arm, mount) in enumerate(zip(arms, mounts, strict=True)):
         nearest = min(math.dist(mount, other) for other in mounts if other is not mount)
-        if arm > ARM_OF_SPACING * nearest:
-            hint = _meant(arm, "mm", "m", arm / 1000 <= ARM_OF_SPACING * nearest)
-            raise InputError(
-                f"{_place(plant, number, 'arm')} {arm:g} m is longer than the {nearest:.3g} m to the next drone{hint}"
-            )
-    yaws = zip(plant.of_drones("arm"), plant.of_drones("yaw_per_thrust"), strict=True)
-    for number, (arm, yaw) in enumerate(yaws):
-        if yaw > YAW_OF_ARM * arm:
-            hint = _meant(yaw, "mm", "m", yaw / 1000 <= YAW_OF_ARM * arm)
-            raise InputError(
-                f"{_place(plant, number, 'yaw_per_thrust')} {yaw:g} m is more than {YAW_OF_ARM:g} times the arm of "
-                f"{arm:g} m{hint}"
-            )
-    reach, longest = max(math.hypot(*mount) for mount in mounts), max(plant.object_size)
-    if longest > SIZE_OF_REACH * reach:
-        hint = _meant(longest, "mm", "m", longest / 1000 <= SIZE_OF_REACH * reach)
-        raise InputError(
-            f"plant.object_size {longest:g} m is more than {SIZE_OF_REACH:g} times the {reach:.3g} m at which drones "
-            f"are mounted{hint}"
-        )
+        what = f"longer than the {nearest:.3g} m to the next drone"
+        _refuse_above(ARM_OF_SPACING * nearest, arm, "m", _place(plant, number, "arm"), what)
+    for number, (arm, yaw) in enumerate(zip(arms, plant.of_drones("yaw_per_thrust"), strict=True)):
+        what = f"more than {YAW_OF_ARM:g} times the arm of {arm:g} m"
+        _refuse_above(YAW_OF_ARM * arm, yaw, "m", _place(plant, number, "yaw_per_thrust"), what)
+    reach = max(math.hypot(*mount) for mount in mounts)
+    what = f"more than {SIZE_OF_REACH:g} times the {reach:.3g} m at which drones are mounted"
+    _refuse_above(SIZE_OF_REACH * reach, max(plant.object_size), "m", "plant.object_size", what)
 
 
 def _check_lags(plant: Plant) -> None:
     for number, lag in enumerate(plant.of_drones("rotor_lag")):
-        if lag > LONGEST_LAG:
-            hint = _meant(lag, "ms", "s", lag / 1000 <= LONGEST_LAG)
-            raise InputError(f"{_place(plant, number, 'rotor_lag')} {lag:g} s is more than {LONGEST_LAG:g} s{hint}")
+        _refuse_above(LONGEST_LAG, lag, "s", _place(plant, number, "rotor_lag"), f"more than {LONGEST_LAG:g} s")
 
 
 def _check_weight(config: Config) -> None:
@@ -148,36 +141,35 @@ def _gyrates(drone: Drone, arm: float) -> bool:
     return GYRATION[0] <= math.sqrt(max(drone.inertia) / drone.mass) / arm <= GYRATION[1]
 
 
+def _inertia_fault(
+    name: str, inertia: float, mass: float, beside: str, length: float, usual: tuple[float, float], *units: str
+) -> str:
+    """The sentence that `inertia` does not fit `mass`, with a hint at a unit of `usual` gyration over length."""
+    radius, hint = math.sqrt(inertia / mass), ""
+    for unit in units:
+        if usual[0] <= math.sqrt(INERTIA_UNITS[unit]) * radius / length <= usual[1]:
+            hint = f"; {inertia:g} {unit} would be {inertia * INERTIA_UNITS[unit]:.3g} kg m2"
+    return (
+        f"{name} {inertia:g} kg m2 with {mass:g} kg makes a radius of gyration of {radius:.3g} m beside {beside} of "
+        f"{length:.3g} m{hint}"
+    )
+
+
 def _check_inertia(plant: Plant) -> None:
     for number, (drone, arm) in enumerate(zip(plant.drones, plant.of_drones("arm"), strict=True)):
-        if _gyrates(drone, arm):
-            continue
-        radius = math.sqrt(max(drone.inertia) / drone.mass)
-        hint = ""
-        for unit, factor in (("g mm2", 1e-9), ("g cm2", 1e-7), ("kg mm2", 1e-6), ("g m2", 1e-3)):
-            if 0.2 <= math.sqrt(max(drone.inertia) * factor / drone.mass) / arm <= 2.0:
-                hint = f"; {max(drone.inertia):g} {unit} would be {max(drone.inertia) * factor:.3g} kg m2"
-        raise InputError(
-            f"plant.drones.{number}.inertia {max(drone.inertia):g} kg m2 with {drone.mass:g} kg makes a radius of "
-            f"gyration of {radius:.3g} m beside an arm of {arm:g} m{hint}; check mass, inertia and arm"
-        )
+        if not _gyrates(drone, arm):
+            name, largest = f"plant.drones.{number}.inertia", max(drone.inertia)
+            fault = _inertia_fault(name, largest, drone.mass, "an arm", arm, (0.2, 2.0), *INERTIA_UNITS)
+            raise InputError(f"{fault}; check mass, inertia and arm")
 
 
 def _check_carrier(plant: Plant) -> None:
     """The carrier's radius of gyration is not much larger than the distance of its farthest mount or edge."""
-    if not plant.carrier_mass:
-        return
-    largest, reach = max(plant.carrier_inertia), max(*plant.object_size, *(math.hypot(*d.mount) for d in plant.drones))
-    radius = math.sqrt(largest / plant.carrier_mass)
-    if radius > CARRIER_OF_REACH * reach:
-        hint = ""
-        for unit, factor in (("g cm2", 1e-7), ("g m2", 1e-3)):
-            if 0.1 <= math.sqrt(largest * factor / plant.carrier_mass) / reach <= 1.5:
-                hint = f"; {largest:g} {unit} would be {largest * factor:.3g} kg m2"
-        raise InputError(
-            f"plant.carrier_inertia {largest:g} kg m2 with {plant.carrier_mass:g} kg makes a radius of gyration of "
-            f"{radius:.3g} m beside a reach of {reach:.3g} m{hint}"
-        )
+    reach = max(*plant.object_size, *(math.hypot(*drone.mount) for drone in plant.drones))
+    largest, mass = max(plant.carrier_inertia), plant.carrier_mass
+    if mass and math.sqrt(largest / mass) > CARRIER_OF_REACH * reach:
+        units = ("g cm2", "g m2")
+        raise InputError(_inertia_fault("plant.carrier_inertia", largest, mass, "a reach", reach, (0.1, 1.5), *units))
 
 
 def _check_loop(config: Config) -> None:

@@ -190,7 +190,7 @@ class Reward:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the exported policy on the reference scenario, for `eval.py --check`; 0: no bound."""
+    """Bounds that `eval.py --check` enforces for the exported policy on the reference scenario; 0: none."""
 
     x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0, high=1e12)
     settling_time: float = setting(4.0, "2 % settling time [s]", low=0, high=1e12)
