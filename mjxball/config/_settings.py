@@ -23,8 +23,10 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Autopilot:
-    """The autopilot of each drone. `ideal` is the PD loop of `Attitude`; `crazyflie` is the cascade of that firmware,
-    with the gains kp, ki, kd of its parameters pid_attitude.* and pid_rate.* and its defaults.
+    """The attitude controller on board of each drone.
+
+    `ideal` is the PD loop of `Attitude`; `crazyflie` is the cascade of that firmware, with the gains kp, ki, kd of its
+    parameters pid_attitude.* and pid_rate.* and its defaults.
     """
 
     kind: Literal["ideal", "crazyflie"] = setting("ideal", "ideal: PD of `attitude`; crazyflie: the firmware's cascade")
