@@ -1,4 +1,4 @@
-"""What the command lines share: exit codes, output places, and flags generated from the configuration."""
+"""Shared by all command lines: parser, exit codes, output paths, and flags generated from the configuration."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from mjxball.reading import LARGEST, SMALLEST, is_number, shown
 from mjxball.terminal import sentence, warn
 from mjxball.xla import explained
 
-FAULT = 3  # exit code after an error of the program, where 1 is a result
-# Packages that another extra than `train` brings.
+FAULT = 3  # exit code after a defect of the program; 1 says that a check failed
+# The extra that installs a package, if it is not `train`.
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "osqp": "mpc"}
 EXTRAS |= dict.fromkeys(("cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
 SHELLS = ("bash", "zsh", "tcsh")
@@ -33,7 +33,7 @@ Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one sentence on stderr and exit code 2, and whose numbers are bounded."""
+    """An argument parser with bounded numbers, whose errors are one sentence on stderr and exit code 2."""
 
     def __init__(self, *given: Any, **named: Any):
         super().__init__(*given, **named)
@@ -43,17 +43,17 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
-        """As `argparse` does, and a list may begin with a negative number: `--scenario.mass_change -0.1,0.2`."""
+        """Like argparse, but a list may begin with a negative number: `--scenario.mass_change -0.1,0.2`."""
         words: list[str] = []
         for word in sys.argv[1:] if args is None else args:
             if words and re.fullmatch(r"--[^=]+", words[-1]) and re.match(r"-\.?\d[^,]*,", word):
-                words[-1] += f"={word}"  # else Python before 3.14 takes the list for a flag
+                words[-1] += f"={word}"  # Python before 3.14 takes the list for a flag
             else:
                 words.append(word)
         return super().parse_args(words, namespace)
 
     def error(self, message: str) -> None:  # type: ignore[override]
-        """Print `message`, with the flag that is most like an unknown one, and exit with code 2."""
+        """Print `message`, for an unknown flag with the most similar known one, and exit with code 2."""
         unknown = re.match(r"unrecognized arguments: (--[^ =]+)", message)
         known = [flag for action in self._actions if action.help != argparse.SUPPRESS for flag in action.option_strings]
         similar = difflib.get_close_matches(unknown[1], known, 1, cutoff=0.8) if unknown else []
@@ -61,7 +61,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(2)
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """What argparse prints; it would pass over a text that cannot be written."""
+        """Print a text of argparse, which itself ignores that a text cannot be written."""
 
         def write() -> int:
             print(message, end="", file=file or sys.stderr)
@@ -72,7 +72,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _number(text: str, kind: type[float] | type[int]) -> float:
-    """What any flag that takes a number is given. Raises ArgumentTypeError if nothing can be computed with it."""
+    """The number of a flag; ArgumentTypeError for text, NaN, infinity, or a size that float32 cannot compute with."""
     with contextlib.suppress(ValueError):
         if is_number(number := kind(text)):
             return number
@@ -81,7 +81,7 @@ def _number(text: str, kind: type[float] | type[int]) -> float:
 
 
 class Formatter(argparse.HelpFormatter):
-    """As argparse's, and what is longer than a line of the terminal is folded: a flag, usage or heading."""
+    """A help formatter that also wraps flags, usage and headings that are longer than a line of the terminal."""
 
     def __init__(self, prog: str, **given: Any):
         super().__init__(prog, **{"max_help_position": 32, **given})
@@ -90,7 +90,7 @@ class Formatter(argparse.HelpFormatter):
         return self._folded(super()._format_action_invocation(action), self._current_indent)
 
     def start_section(self, heading: str | None) -> None:
-        """What stands above a group of flags."""
+        """Begin a group of flags under a wrapped heading."""
         super().start_section(heading and self._folded(heading, 0))
 
     def _format_usage(self, *given: Any) -> str:
@@ -104,7 +104,7 @@ class Formatter(argparse.HelpFormatter):
         return "\n".join(indent + line for line in lines)
 
     def _folded(self, text: str, indent: int) -> str:
-        plain = re.sub(r"\x1b\[[\d;]*m", "", text)  # Python 3.14 writes in colours
+        plain = re.sub(r"\x1b\[[\d;]*m", "", text)  # without the colours of Python 3.14
         width = self._width - indent
         if max(map(len, plain.splitlines())) <= width:
             return text
@@ -116,13 +116,13 @@ class Formatter(argparse.HelpFormatter):
 
 
 class Command(Parser):
-    """The parser of one command of a program, behind `add_subparsers`: it names itself what it does not know."""
+    """The parser of one command of a program with several (`add_subparsers`); reports its unknown flags itself."""
 
     def __init__(self, **given: Any):
         super().__init__(allow_abbrev=False, formatter_class=Formatter, **given)
 
     def parse_known_args(self, *given: Any, **named: Any) -> Any:
-        """As `argparse` does; what is left is refused here, where the flags are known."""
+        """Like argparse, but unknown arguments are an error here, where similar flags are known."""
         found, left = super().parse_known_args(*given, **named)
         if left:
             self.error(f"unrecognized arguments: {' '.join(left)}")
@@ -130,9 +130,9 @@ class Command(Parser):
 
 
 class Help(argparse.Action):
-    """`--help` prints the common flags, `--help all` every one; `--help TOPIC` is the program's own.
+    """`--help` prints the common flags, `--help all` every flag; other topics depend on the program.
 
-    `describe(parser, namespace, topic)` returns the flags to be printed, None for all, and may change their texts.
+    `describe(parser, namespace, topic)` returns the flags to print, None for all, and may change their texts.
     """
 
     def __init__(self, option_strings: Sequence[str], dest: str, describe: Describe, **given: Any):
@@ -150,15 +150,15 @@ class Help(argparse.Action):
                 action.help = argparse.SUPPRESS
         for group in parser._action_groups:
             if any(action.help == argparse.SUPPRESS for action in group._group_actions):
-                group.description = None  # of the whole group
+                group.description = None  # it describes the whole group
         parser.print_help()
         parser.exit()
 
 
 class Completion(argparse.Action):
-    """`--print-completion SHELL`: how the shell completes the command, see `shtab`, which is loaded here alone.
+    """`--print-completion SHELL` prints a script by which the shell completes the command (shtab).
 
-    Of an action with `suggested` words these are offered, of a path and of what has no flag files.
+    Completed are the `suggested` words of an action that has any, and files for paths and positional arguments.
     """
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
@@ -186,9 +186,9 @@ def make_parser(
     epilog: str | None = None,
     describe: Describe | None = None,
 ) -> Parser:
-    """The parser of the command `program`, with the `--help` and `--version` of every command; no flag is shortened.
+    """A parser of the command `program` with `--help`, `--version` and completion; flags cannot be abbreviated.
 
-    Installed commands (`mjxball-train`) are called by their own name, whatever `program` says. `describe`: see `Help`.
+    Installed commands (`mjxball-train`) show their own name instead of `program`. `describe`: see `Help`.
     """
     called = Path(sys.argv[0]).stem
     name = called if called.startswith("mjx") else program
@@ -198,33 +198,33 @@ def make_parser(
         about = "show the common flags, of TOPIC all every flag, and exit"
         parser.add_argument("-h", "--help", action=Help, describe=describe, metavar="TOPIC", help=about)
     parser.add_argument("--version", action="version", version=f"mjxball {__version__}", help="show it and exit")
-    if " " not in name:  # what a shell can complete
+    if " " not in name:  # shells complete commands of one word
         about = f"print what makes {', '.join(SHELLS)} complete this command, and exit"
         parser.add_argument("--print-completion", action=Completion, choices=SHELLS, metavar="SHELL", help=about)
     return parser
 
 
 def quit_on_interrupt() -> None:
-    """Let Ctrl-C end the process at once and silently, code 130: an import cut short can abort the interpreter."""
+    """Make Ctrl-C end the process at once, without output, code 130; an interrupted import can abort Python."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 
 def collect_seldom() -> None:
-    """Look for garbage seldom: tracing makes millions of objects that live on, and Python goes through all of them.
+    """Collect garbage less often: tracing makes millions of lasting objects, which every collection visits.
 
-    As often as it does by itself that takes a tenth of a short training, and 0.7 s at the end of the process.
+    Python's default costs a tenth of the time of a short training, and 0.7 s at the end of the process.
     """
     gc.set_threshold(100_000, 50, 100)
     atexit.register(gc.freeze)
 
 
 def switch_often() -> None:
-    """Let Python's threads take turns every 0.5 ms instead of 5: what trains waits each time that another imports."""
+    """Switch threads every 0.5 ms instead of 5: the training thread waits whenever another thread imports."""
     sys.setswitchinterval(5e-4)
 
 
 def run_command(command: Callable[[], int]) -> int:
-    """Run `command`; bad input, a failing file or a missing package becomes one line on stderr and exit code 2."""
+    """Run `command`. Bad input, a failing file or a missing package is one line on stderr and exit code 2."""
     try:
         code = command()
         if sys.stdout is not None:
@@ -235,11 +235,11 @@ def run_command(command: Callable[[], int]) -> int:
         return 2
     except OSError as error:
         where = error.filename or "standard output or a file"
-        _let_go_of_stdout()
+        _discard_stdout()
         warn(f"error: {where}: {error.strerror or error}")
         return 2
     except ModuleNotFoundError as error:
-        if (error.name or "").startswith("mjx"):  # of this distribution
+        if (error.name or "").startswith("mjx"):  # a defect of this distribution
             raise
         extra = EXTRAS.get(error.name or "", "train")
         warn(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'")
@@ -252,8 +252,8 @@ def run_command(command: Callable[[], int]) -> int:
         return 2
 
 
-def _let_go_of_stdout() -> None:
-    """If it cannot be written: else Python tries again as it ends, and reports that in lines of its own."""
+def _discard_stdout() -> None:
+    """Redirect stdout if it cannot be written; Python would try again at exit and print its own error."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -261,9 +261,9 @@ def _let_go_of_stdout() -> None:
 
 
 def output_directory(path: Path, but: Sequence[str] = ()) -> Path:
-    """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing.
+    """`path` if it is an empty or a missing directory that can be written, else InputError. Creates nothing.
 
-    Files called as in `but` do not count.
+    Files with names in `but` are ignored.
     """
     if (path.exists() or path.is_symlink()) and not path.is_dir():
         raise InputError(f"output directory {path} exists and is no directory")
@@ -278,7 +278,7 @@ def output_directory(path: Path, but: Sequence[str] = ()) -> Path:
 
 
 def output_file(path: Path, suffix: str) -> Path:
-    """Return `path` if it ends in `suffix`, its directory exists and it does not, else raise InputError."""
+    """`path` if it ends in `suffix`, does not exist and can be written to its directory, else InputError."""
     if path.suffix != suffix:
         raise InputError(f"output file {path} must end in {suffix}")
     if path.exists():
@@ -291,7 +291,7 @@ def output_file(path: Path, suffix: str) -> Path:
 
 
 def add_config_flags(parser: argparse.ArgumentParser) -> None:
-    """Add `--<path> VALUE` for every leaf of the configuration, with its help text, a group for each section."""
+    """Add `--<path> VALUE` with its help text for every setting, in one group for each section."""
     groups: dict[str, Any] = {}
     for path, _, item in configs.leaves(configs.Config()):
         section = path.partition(".")[0]
@@ -302,7 +302,7 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def show_defaults(parser: argparse.ArgumentParser, settings: configs.Config) -> None:
-    """Add to the help of every `--<path>` its value in `settings`."""
+    """Append the value in `settings` to the help of every `--<path>` as its default."""
     values = {path: configs.to_text(value) or "none" for path, value, _ in configs.leaves(settings)}
     for action in parser._actions:
         text = values.get(action.dest.removeprefix("config:"))
@@ -311,7 +311,7 @@ def show_defaults(parser: argparse.ArgumentParser, settings: configs.Config) -> 
 
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:
-    """Return `config` with the settings of `--plant FILE` and every `--<path> VALUE` that was given, validated."""
+    """`config` with the settings of `--plant FILE` and of every given `--<path> VALUE`, validated."""
     flags = {
         name.removeprefix("config:"): text
         for name, text in vars(options).items()
@@ -321,7 +321,7 @@ def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> c
 
 
 def read_plant(path: Path) -> configs.PlantFile:
-    """The plant file `path`, or the shipped one of that name. InputError if it is neither, or its preset unknown."""
+    """The plant file `path` or the shipped plant of that name; InputError if there is none or its preset is unknown."""
     found = configs.read_plant(path)
     if found.preset is not None and found.preset not in configs.PRESETS:
         raise InputError(f"plant file {path}: preset {found.preset!r} is none of {', '.join(configs.PRESETS)}")
@@ -329,9 +329,9 @@ def read_plant(path: Path) -> configs.PlantFile:
 
 
 def plant_setup(path: Path | None, default: str = "paper") -> configs.Config:
-    """The preset `default`, or on the plant `path` the one that it belongs to, if it says so; validated.
+    """The preset of the plant file `path`, else the preset `default`, with that plant; validated.
 
-    What is flown is this plant: the other teams and rigs that the preset trains on are left out.
+    Flights are on this plant alone, without the other teams and random rigs on which the preset trains.
     """
     if path is None:
         return configs.preset(default)
@@ -343,7 +343,7 @@ def plant_setup(path: Path | None, default: str = "paper") -> configs.Config:
 
 
 def apply_plant(config: configs.Config, path: Path | None) -> configs.Config:
-    """`config` with the settings of the plant file `path`, if there is one, validated."""
+    """`config` with the settings of the plant file `path`, validated; without a path `config`."""
     return config if path is None else _with_plant(config, path)
 
 
@@ -353,7 +353,7 @@ def _with_plant(
     flags: Mapping[str, str] | None = None,
     found: configs.PlantFile | None = None,
 ) -> configs.Config:
-    """`mjxball.config.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
+    """`mjxball.config.with_plant`; stderr lists what a model leaves open and is assumed, and what of it is ignored."""
     found = found or (None if path is None else read_plant(path))
     result = configs.with_plant(config, path, flags, found)
     if path is not None and found is not None:

@@ -1,4 +1,4 @@
-"""What files of others must be: JSON that says everything once, numbers to compute with, time that runs forward.
+"""Checks of files from outside: JSON without repeated keys, numbers of usable size, increasing times.
 
 Standard library only.
 """
@@ -16,23 +16,23 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeGuard
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
-GAP = 5.0  # steps from which on a recording has a hole
-STRAY = 0.1  # share of rows whose time may not follow
-LARGEST, SMALLEST = 1e12, 1e-30  # sizes of a number that is not 0: products of others are endless or 0 in float32
-MOST_DIGITS = 20  # of a whole number, which 64 bits hold; Python would take thousands, and no float does
+GAP = 5.0  # median steps; a longer one is a gap of a recording
+STRAY = 0.1  # largest share of rows whose time does not increase
+LARGEST, SMALLEST = 1e12, 1e-30  # of a number other than 0; products beyond are infinite or 0 in float32
+MOST_DIGITS = 20  # of a whole number of 64 bits; Python takes thousands, which no float holds
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The value of a JSON text. Raises ValueError, also if an object has one key twice; RecursionError if too deep.
+    """The value of a JSON text. Raises ValueError, also for a key that an object has twice; RecursionError if too deep.
 
-    The standard leaves open which of both counts; Python would take the last one without a word. A whole number that
-    64 bits do not hold is inf, as Python makes of 1e400: whoever checks a number says which one it is.
+    The standard does not say which of two equal keys counts, and Python silently takes the last. Whole numbers of more
+    than 20 digits become infinity, as 1e400 does in Python, so that the check of that value can name it.
     """
     return json.loads(text, object_pairs_hook=_once, parse_int=_whole)
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The values of a TOML text, whole numbers as `parse_json` has them. Raises ValueError; RecursionError."""
+    """The values of a TOML text, with whole numbers as in `parse_json`. Raises ValueError or RecursionError."""
     return {name: _bounded(value) for name, value in tomllib.loads(text).items()}
 
 
@@ -45,20 +45,20 @@ def _bounded(value: Any) -> Any:
 
 
 def is_number(value: Any, most: float = LARGEST) -> TypeGuard[float]:
-    """Whether `value` is a number that can be computed with: no truth value, 0 or from `SMALLEST` to `most` in size."""
+    """Whether `value` is an int or float (no bool) that is 0, or from `SMALLEST` to `most` in size."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return value == 0 or SMALLEST <= abs(value) <= most
 
 
 def shown(value: Any) -> str:
-    """`value` of a file or a command line as a sentence shows it."""
+    """`value` of a file or a command line as error messages show it, shortened."""
     text = repr(value)
     return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}..."
 
 
 def near(name: str, known: Iterable[str], cutoff: float = 0.8) -> str:
-    """The one of the `known` names that is spelt like `name`, as a question; empty if there is none."""
+    """' (did you mean X?)' with the `known` name X most similar to `name`; empty if none is."""
     return "".join(f" (did you mean {one}?)" for one in difflib.get_close_matches(name, list(known), 1, cutoff))
 
 
@@ -78,7 +78,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def time_fault(before: float, after: float) -> str | None:
-    """What is wrong with a time [s] `after` another one; None if it is later."""
+    """A phrase if the time `after` [s] is not finite or not later than `before` [s], else None."""
     if not math.isfinite(after):
         return "a time is not finite"
     if after < before:
@@ -87,13 +87,14 @@ def time_fault(before: float, after: float) -> str | None:
 
 
 def following(times: Sequence[float]) -> list[int]:
-    """Numbers of the most rows whose `times` [s] increase; the others' times are how some writers say "missing".
+    """Indices of a longest subsequence of rows with increasing `times` [s].
 
-    Raises ValueError with a phrase if more than a tenth are others: nothing says when the rest happened.
+    Other rows are left out: some writers mark missing samples by such times. Raises ValueError with a phrase if they
+    are more than a tenth.
     """
-    ends: list[float] = []  # of series of one row, of two, and so on, the earliest
-    rows: list[int] = []  # at these ends
-    before: list[int] = []  # each row's
+    ends: list[float] = []  # [n]: the earliest last time of an increasing series of n + 1 rows
+    rows: list[int] = []  # [n]: the row with that time
+    before: list[int] = []  # the row before each row in its series, -1: none
     for number, now in enumerate(times):
         place = bisect.bisect_left(ends, now) if math.isfinite(now) else 0
         before.append(rows[place - 1] if place else -1)
@@ -109,9 +110,10 @@ def following(times: Sequence[float]) -> list[int]:
 
 
 def check_times(times: Sequence[float], shortest: float = 0.0, longest: float = math.inf) -> list[str]:
-    """What a reader should know of `times` [s], two or more: a phrase if rows are missing, else nothing.
+    """A phrase about gaps in two or more `times` [s], in a list; the list is empty without gaps.
 
-    Raises ValueError with a phrase if they do not increase, or if the median step is not `shortest` to `longest`.
+    Raises ValueError with a phrase if they do not increase, or if the median step [s] is not within `shortest` and
+    `longest`.
     """
     for number, (before, after) in enumerate(itertools.pairwise(times), start=2):
         if (fault := time_fault(before, after)) is not None:

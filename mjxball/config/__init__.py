@@ -1,30 +1,17 @@
 """Typed, frozen configuration: one source for defaults, validation, JSON, hashes and the command line.
 
-Importing it needs the standard library only.
+Importing it needs NumPy only.
 """
 
 from mjxball.config._leaf import Range
 from mjxball.config._learning import Gradient, Ppo, Sac
-from mjxball.config._load import follow_plant
 from mjxball.config._model_source import MAX_ELEMENTS, MAX_PIXELS
 from mjxball.config._plant import Drone, Plant
-from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
+from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, follow_plant, read_plant, with_plant
 from mjxball.config._plausible import check_lift, thrust_over_weight, total_mass
 from mjxball.config._presets import PRESETS, preset
-from mjxball.config._rigs import Rigs
-from mjxball.config._settings import (
-    Attitude,
-    Autopilot,
-    Bounds,
-    Command,
-    Config,
-    Follower,
-    Leader,
-    Motion,
-    Reward,
-    ScenarioRanges,
-    Timing,
-)
+from mjxball.config._scenario import Motion, Rigs, ScenarioRanges
+from mjxball.config._settings import Attitude, Autopilot, Bounds, Command, Config, Follower, Leader, Reward, Timing
 from mjxball.config._tree import (
     about_section,
     apply_overrides,

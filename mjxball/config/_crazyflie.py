@@ -6,23 +6,15 @@ from dataclasses import replace
 
 from mjxball.config._learning import Sac
 from mjxball.config._plant_file import read_plant
-from mjxball.config._settings import (
-    Bounds,
-    Command,
-    Config,
-    Follower,
-    Leader,
-    Reward,
-    ScenarioRanges,
-    Timing,
-)
+from mjxball.config._scenario import ScenarioRanges
+from mjxball.config._settings import Bounds, Command, Config, Follower, Leader, Reward, Timing
 from mjxball.config._tree import apply_overrides
 
 PAIR = replace(
     apply_overrides(Config(), read_plant("crazyflie").settings),
     timing=Timing(control_period=0.01, physics_steps=5, episode_steps=1500),
-    # Stiff in height and with an integral term, so that the leader finds the thrust for its share of the weight: what
-    # the two lift apart acts over half the stick, and beyond 4 % of hover no drone's rotors hold that about roll.
+    # Stiff in height, with an integral, so that the leader's thrust fits its share of the weight: a difference of lift
+    # acts over half the stick, and beyond 4 % of hover thrust the rotors of one drone cannot hold it about roll.
     leader=Leader(
         kp=(1.0, 1.0, 2.5),
         kd=(1.6, 1.6, 3.5),
@@ -51,7 +43,7 @@ LARGE_SAC = Sac(
 
 
 def stand() -> Config:
-    """The paper's experiment: roll and height free, pitch locked, a rolling ball, the paper's gains and thrust law."""
+    """The paper's experiment: roll and height free, pitch locked, a rolling ball, the paper's gains and thrust."""
     return replace(
         apply_overrides(PAIR, read_plant("stand").settings),
         preset="stand",
@@ -101,7 +93,7 @@ def flight() -> Config:
     return replace(
         PAIR,
         preset="flight",
-        # The leader's integral hides what the follower commands where no load turns the pair, until motors are full.
+        # About the other axis the leader's integral would compensate for the follower, until motors are at their limit.
         follower=Follower(
             load_axis_only=True,
             action_scale_tilt=0.12,
@@ -115,7 +107,7 @@ def flight() -> Config:
             start_velocity=0.1,
             start_tilt=0.05,
             cg_speed=(0.2, 1.2),
-            cg_amplitude=(0.0, 0.02),  # of the plain 2.1, whose thrust leaves no more; see `plants/`
+            cg_amplitude=(0.0, 0.02),  # the Crazyflie 2.1 has no thrust for more; see `plants/`
             object_mass=(0.015, 0.02),
             mass_known=False,
             noise=(0.0, 0.5),

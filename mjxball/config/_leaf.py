@@ -1,4 +1,4 @@
-"""How a setting is declared: default, help text and bounds, all in the dataclass."""
+"""How a setting is declared: its default, help text and bounds stand in the dataclass."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Vector3 = tuple[float, float, float]
 Range = tuple[float, float]
 
 
-MOST = 256  # numbers in a tuple of any length
+MOST = 256  # entries of a tuple of any length
 
 
 def setting(
@@ -21,11 +21,11 @@ def setting(
     ordered: bool = False,
     most: int = MOST,
 ) -> Any:
-    """Declare a leaf: default, help text, and the range in which each of its numbers must lie, both ends included.
+    """Declare a setting: default, help text, and the closed range for each of its numbers.
 
-    Every number has one. It is what some flight or training could want, not what is wise; those of a plant leave room
-    for a wrong unit, which `_plausible` names. `ordered` asks for low <= high of a pair; a tuple of any length holds at
-    most `most` numbers.
+    Every number needs a range. It covers what some flight or training could use, not only what is sensible; the ranges
+    of a plant are wide enough for a value in a wrong unit, which `_plausible` reports with a hint. `ordered` requires
+    low <= high of a pair; a tuple of any length has at most `most` entries.
     """
     if (low is None or high is None) and not isinstance(default, (bool, str)):
         raise TypeError(f"the setting of default {default!r} has no range: {about}")
@@ -33,6 +33,6 @@ def setting(
     return field(default=default, metadata=bounds)
 
 
-def drawn(default: Range, about: str, **bounds: Any) -> Any:
-    """Declare a range that resets draw from, low <= high."""
+def sampled(default: Range, about: str, **bounds: Any) -> Any:
+    """Declare a range (low, high) from which every reset samples uniformly."""
     return setting(default, about, ordered=True, **bounds)

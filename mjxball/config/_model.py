@@ -1,4 +1,4 @@
-"""What a model, MJCF or URDF, says of a drone or of a rig: mass, centre, inertia and rotors. Needs MuJoCo."""
+"""A drone or a rig from a model in MJCF or URDF: masses, centres, inertia and rotors. Needs MuJoCo."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from mjxball.config._model_acts import (
     refuse_other_models,
     without,
 )
-from mjxball.config._model_source import MAX_MODEL, ROTOR, compiled, heard, printable
+from mjxball.config._model_source import MAX_MODEL, ROTOR, captured_warnings, compiled, printable
 from mjxball.errors import InputError
 from mjxball.files import read_text
 
-UPRIGHT = 1e-3  # [rad] that a rotor may lean
+UPRIGHT = 1e-3  # largest angle of a rotor to z [rad]
 WANTED = "expected rotors: <motor> on a <site> with gear 0 0 1 0 0 YAW"
 Vector = np.ndarray
 
 
-class Told(NamedTuple):
-    """A rotor of which the file beside the model tells."""
+class RotorSite(NamedTuple):
+    """The position of a rotor, from the file beside the model."""
 
-    name: str  # of the site or body where it is; of `place` the body in whose axes that is, "": the one that flies
+    name: str  # a site or body at the rotor; with `place` the body in whose axes that is, "": the free body
     place: tuple[float, float, float] | None = None  # [m]
 
 
 class ModelDrone(NamedTuple):
-    """A drone; a single rotor stands for the thrust of all four, whose places are not known."""
+    """A drone; a single rotor stands for the thrust of all four, whose positions are then unknown."""
 
     name: str
     rigid: Rigid
@@ -43,19 +43,19 @@ class ModelDrone(NamedTuple):
 
 
 class Model(NamedTuple):
-    """One drone, or a rig of several on a carrier."""
+    """One drone, or a rig of several drones on a carrier."""
 
     drones: tuple[ModelDrone, ...]
-    carrier: Rigid | None  # what is no drone and no load; None of a single drone
-    load: tuple[Rigid, str] | None  # a body on slides as it is at the start, and their axes: x, y or xy
+    carrier: Rigid | None  # the bodies without drones and load; None for a single drone
+    load: tuple[Rigid, str] | None  # a body on slides, as at the start, and the slides' axes: x, y or xy
     gravity: float  # [m/s2]
-    left_out: tuple[str, ...]  # of what the model says
+    left_out: tuple[str, ...]  # properties of the model that a plant does not have
 
 
-def read_model(path: Path, rotors: Sequence[Told] = ()) -> Model:
-    """The model in `path`; `rotors` tells where rotors are, if no actuators say so.
+def read_model(path: Path, rotors: Sequence[RotorSite] = ()) -> Model:
+    """The model in `path`; `rotors` are the positions of rotors if no actuators give them.
 
-    Raises InputError, one sentence, for what is no model, or neither a quadrotor nor a rigid rig of several.
+    Raises InputError unless it is a model of a quadrotor or of a rigid rig of several.
     """
     text = read_text(path, "model", MAX_MODEL)
     try:
@@ -66,23 +66,23 @@ def read_model(path: Path, rotors: Sequence[Told] = ()) -> Model:
 
 
 class _Tree:
-    """A compiled model at its start: the one tree of bodies that flies."""
+    """The one tree of bodies that flies in a compiled model, in its initial state."""
 
-    def __init__(self, model: Any, data: Any, is_urdf: bool, told: Sequence[Told], path: Path):
+    def __init__(self, model: Any, data: Any, is_urdf: bool, sites: Sequence[RotorSite], path: Path):
         import mujoco
 
         self.m, self.d, self.mujoco = model, data, mujoco
-        self.is_urdf, self.told, self.beside = is_urdf, told, path.with_suffix(".toml").name
+        self.is_urdf, self.sites, self.beside = is_urdf, sites, path.with_suffix(".toml").name
         self.root = self._root()
         self.turn = self.d.xmat[self.root].reshape(3, 3).T
-        self.moments: set[int] = set()  # bodies that actuators turn without pushing
-        self.bearing: set[int] = set()  # bodies at which rotors are
+        self.moments: set[int] = set()  # bodies on which actuators exert moments without forces
+        self.bearing: set[int] = set()  # bodies with rotors
         self.left_out: list[str] = []
         self.thrusters: list[Thruster] = []
         self.slides: list[Slide] = []
 
     def model(self) -> Model:
-        """All that is to be known."""
+        """The model; InputError for what a plant cannot represent."""
         refuse_other_models(self.m, self.root, self._named)
         if self.d.ncon:
             one, other = (self._named("geom", geom) for geom in self.d.contact[0].geom)
@@ -90,13 +90,13 @@ class _Tree:
         drones, carrier, load = self._bodies()
         rigids = [*(drone.rigid for drone in drones), *([carrier] if carrier else [])]
         slid = load[0] if load else None
-        with heard():
+        with captured_warnings():
             bare, lines = without(self.m, self.slides, slid.mass if slid else 0.0, self._named)
             check_all_was_named(bare, rigids, slid, self.slides, self.thrusters)
         return Model(drones, carrier, load, -self.m.opt.gravity[2], (*self.left_out, *lines))
 
     def _bodies(self) -> tuple[tuple[ModelDrone, ...], Rigid | None, tuple[Rigid, str] | None]:
-        """Drones, carrier and load."""
+        """(drones, carrier, load)."""
         groups = self._groups()
         if len(groups) == 1:
             (rotors,) = groups.values()
@@ -128,10 +128,10 @@ class _Tree:
         return free[0]
 
     def _groups(self) -> dict[int, list[Rotor]]:
-        """The rotors of every drone, by the drone's body."""
+        """The rotors of every drone, by the body of the drone."""
         m = self.m
         found: dict[int, list[Rotor]] = {}
-        for body, rotor in self._told_rotors() if self.told or self.is_urdf else self._actuated():
+        for body, rotor in self._listed_rotors() if self.sites or self.is_urdf else self._actuated():
             found.setdefault(body, []).append(rotor)
         self.bearing = set(found)
         if not found:
@@ -139,7 +139,7 @@ class _Tree:
             raise InputError(f"it has no rotors, {f'expected {where}' if self.is_urdf else WANTED}")
         if len(found) > 1 and not self.moments and all(len(rotors) == 1 for rotors in found.values()):
             groups: dict[int, list[Rotor]] = {}
-            for body, (rotor,) in found.items():  # each in a body of its own
+            for body, (rotor,) in found.items():  # each rotor is a body
                 groups.setdefault(int(m.body_parentid[body]), []).append(rotor)
             found = groups
         for body, rotors in found.items():
@@ -148,30 +148,30 @@ class _Tree:
                 raise InputError(f"{self._named('body', body)} has {len(rotors)} rotors, expected 4 a drone{named}")
         return found
 
-    def _told_rotors(self) -> list[tuple[int, Rotor]]:
-        """Where the file beside the model says, of a URDF else at the links called like rotors."""
+    def _listed_rotors(self) -> list[tuple[int, Rotor]]:
+        """(body, rotor) from the file beside the model, without it from links of a URDF with names of rotors."""
         m, d, kind = self.m, self.d, self.mujoco.mjtObj
         if m.nu:
             self._leave_out("actuators: the file beside the model tells its rotors")
-        links = [Told(one) for body in range(m.nbody) if ROTOR.search(one := m.body(body).name)]
+        links = [RotorSite(one) for body in range(m.nbody) if ROTOR.search(one := m.body(body).name)]
         found = []
-        for name, told in self.told or links:
-            if told:
+        for name, place in self.sites or links:
+            if place:
                 body = self.mujoco.mj_name2id(m, kind.mjOBJ_BODY, name) if name else self.root
-                self._check_told(name, body)
-                found.append((body, Rotor(self._here(d.xpos[body] + d.xmat[body].reshape(3, 3) @ told))))
+                self._check_listed(name, body)
+                found.append((body, Rotor(self._here(d.xpos[body] + d.xmat[body].reshape(3, 3) @ place))))
                 continue
             site = self.mujoco.mj_name2id(m, kind.mjOBJ_SITE, name)
             body = int(m.site_bodyid[site]) if site >= 0 else self.mujoco.mj_name2id(m, kind.mjOBJ_BODY, name)
-            self._check_told(name, body)
-            place = d.site_xpos[site] if site >= 0 else d.xipos[body] if self.is_urdf else d.xpos[body]
+            self._check_listed(name, body)
+            point = d.site_xpos[site] if site >= 0 else d.xipos[body] if self.is_urdf else d.xpos[body]
             axis = self.turn @ (d.site_xmat[site] if site >= 0 else d.xmat[body]).reshape(3, 3)[:, 2]
             if self.is_urdf and (np.linalg.norm(axis[:2]) > UPRIGHT or axis[2] < 0):
                 raise InputError(f"rotor {name} points along {_words(axis)}, expected 0 0 1: z is up")
-            found.append((body, Rotor(self._here(place))))
+            found.append((body, Rotor(self._here(point))))
         return found
 
-    def _check_told(self, name: str, body: int) -> None:
+    def _check_listed(self, name: str, body: int) -> None:
         if body <= 0 or self.m.body_rootid[body] != self.root:
             raise InputError(f"{self.beside} says rotors {name!r}, expected a site or body of what flies")
 
@@ -181,7 +181,7 @@ class _Tree:
         return [one for number in range(self.m.nu) if (one := self._actuator(number)) is not None]
 
     def _actuator(self, number: int) -> tuple[int, Rotor] | None:
-        """(body, rotor) of an actuator, None if it only turns its body."""
+        """(body, rotor) of an actuator; None if it exerts only a moment."""
         m, name = self.m, self._named("actuator", number)
         site, reference = m.actuator_trnid[number]
         if m.actuator_trntype[number] != self.mujoco.mjtTrn.mjTRN_SITE or reference >= 0:
@@ -215,7 +215,7 @@ class _Tree:
         return body, rotor
 
     def _lag(self, number: int) -> float | None:
-        """Time constant of an actuator [s], 0: none; None if its dynamics are others."""
+        """Time constant of an actuator [s], 0 without one; None for dynamics of another kind."""
         kind, kinds = int(self.m.actuator_dyntype[number]), self.mujoco.mjtDyn
         if kind == kinds.mjDYN_NONE:
             return 0.0
@@ -223,7 +223,7 @@ class _Tree:
         return float(self.m.actuator_dynprm[number][0]) if kind in filters else None
 
     def _inputs(self, number: int, gain: float) -> tuple[float, float]:
-        """Least and largest control [ctrl], by ctrlrange, actrange and forcerange."""
+        """Least and largest control by ctrlrange, actrange and forcerange."""
         m, low, high = self.m, -np.inf, np.inf
         if m.actuator_ctrllimited[number] and not m.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
             low, high = m.actuator_ctrlrange[number]
@@ -235,7 +235,7 @@ class _Tree:
         return float(low), float(high)
 
     def _load(self, lone: bool) -> tuple[tuple[Rigid, str] | None, set[int]]:
-        """The load on its slides, and its bodies; propellers may spin, nothing else may move."""
+        """((load, axes of its slides) or None, its bodies); InputError if other bodies move, besides propellers."""
         m, kinds = self.m, self.mujoco.mjtJoint
         loads: dict[int, set[str]] = {}
         for joint, (body, kind) in enumerate(zip(m.jnt_bodyid, m.jnt_type, strict=True)):
@@ -269,7 +269,7 @@ class _Tree:
         return np.array(self.turn @ (point - self.d.xpos[self.root]))
 
     def _below(self, body: int) -> set[int]:
-        """`body` and all that it carries; MuJoCo numbers them after it."""
+        """`body` and its descendants, which have larger indices."""
         found = {body}
         for other in range(body + 1, self.m.nbody):
             if int(self.m.body_parentid[other]) in found:
@@ -277,7 +277,7 @@ class _Tree:
         return found
 
     def _rigid(self, bodies: Collection[int]) -> Rigid:
-        """The `bodies` as one."""
+        """The `bodies` as one rigid body."""
         ids = sorted(bodies)
         masses, places = self.m.body_mass[ids], np.array([self._here(self.d.xipos[one]) for one in ids]).reshape(-1, 3)
         mass = float(masses.sum())

@@ -1,7 +1,7 @@
-"""What acts in a compiled model beside masses, gravity and rotors: named, and whether that was all. Needs MuJoCo.
+"""Properties of a compiled model that act besides masses, gravity and rotors. Needs MuJoCo.
 
-Whether it was all is measured: without what is named MuJoCo's own accelerations of the model, at random states, are
-those of the masses and rotors that were read.
+Known ones are removed and named. Then MuJoCo's accelerations of the rest, at random states, must be those of the masses
+and rotors that were read, so that nothing is ignored silently.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ import numpy as np
 
 from mjxball.errors import InputError
 
-ACTS = {  # attributes of a joint, and the arrays that hold them
+ACTS = {  # attributes of a joint, and their arrays in MjModel
     "armature": ("dof_armature",),
     "damping": ("dof_damping", "dof_dampingpoly"),
     "frictionloss": ("dof_frictionloss",),
     "stiffness": ("jnt_stiffness", "jnt_stiffnesspoly"),
     "range": ("jnt_limited",),
 }
-ROLLING = 0.4  # armature over mass of a ball that rolls on its slide, which the plant's load does
-STATES = 3  # random ones at which accelerations are compared
-CLOSE = 1e-6  # of the largest acceleration
-WORST = 1e9  # condition of the mass matrix up to which accelerations are that good; no rig is beyond it
-LOCKED = 1e9  # armature of propellers [kg m2]: they do not spin up
+ROLLING = 0.4  # armature over mass that makes a slide a rolling ball, as the plant's load is
+STATES = 3  # random states at which accelerations are compared
+CLOSE = 1e-6  # tolerance, over the largest acceleration
+WORST = 1e9  # condition of the mass matrix up to which CLOSE can be reached; every rig is below it
+LOCKED = 1e9  # armature that keeps propellers from spinning up [kg m2]
 Named = Callable[[str, int], str]
 Vector = np.ndarray
 
 
 class Rigid(NamedTuple):
-    """A rigid body in the axes of the model's free body, from its origin."""
+    """A rigid body in the frame of the model's free body."""
 
     mass: float  # [kg]
     centre: Vector  # (3,) centre of mass [m]
@@ -39,23 +39,23 @@ class Rigid(NamedTuple):
 
 
 class Rotor(NamedTuple):
-    """What pushes up; None is what the model does not say."""
+    """A rotor that pushes along z; None for values that the model does not give."""
 
-    place: Vector  # (3,) in the same axes [m]
+    place: Vector  # (3,) in the same frame [m]
     force_max: float | None = None  # [N]
     yaw: float | None = None  # yaw moment over force, signed [m]
     lag: float | None = None  # time constant of the force [s]
 
 
 class Slide(NamedTuple):
-    """One direction in which the load moves."""
+    """A slide joint of the load."""
 
     joint: int
-    axis: np.ndarray  # (3,) in the axes of the free body
+    axis: np.ndarray  # (3,) in the frame of the free body
 
 
 class Thruster(NamedTuple):
-    """An actuator that is a rotor."""
+    """The actuator of a rotor."""
 
     number: int
     per_input: float  # force over control [N]
@@ -64,7 +64,7 @@ class Thruster(NamedTuple):
 
 
 def refuse_other_models(model: Any, root: int, named: Named) -> None:
-    """Raise InputError for what makes the model fly otherwise than by its weight and its rotors."""
+    """Raise InputError for constraints, other gravity, and springs on the free body, which no plant has."""
     import mujoco
 
     if model.neq or model.ntendon:
@@ -88,7 +88,7 @@ def refuse_other_models(model: Any, root: int, named: Named) -> None:
 
 
 def refuse_disabled(model: Any, number: int, named: Named) -> None:
-    """Raise InputError for an actuator that is switched off."""
+    """Raise InputError if options of the model disable the actuator `number`."""
     import mujoco
 
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
@@ -101,7 +101,7 @@ def refuse_disabled(model: Any, number: int, named: Named) -> None:
 
 
 def without(model: Any, slides: Sequence[Slide], load_mass: float, named: Named) -> tuple[Any, list[str]]:
-    """(`model` without what acts on its free joint and the load's slides, a line for each such attribute)."""
+    """(`model` without `ACTS`, air, contacts and delays, a description of each that it had)."""
     import mujoco
 
     bare, lines = copy.copy(model), []
@@ -117,7 +117,7 @@ def without(model: Any, slides: Sequence[Slide], load_mass: float, named: Named)
         lines += [f"{what} of {named('joint', joint)}" for what in _taken_out(bare, joint, load_mass)]
     hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     bare.dof_armature[model.jnt_dofadr[hinges]] = LOCKED
-    mujoco.mj_setConst(bare, mujoco.MjData(bare))  # armature is part of inertias that MuJoCo keeps
+    mujoco.mj_setConst(bare, mujoco.MjData(bare))  # armature is part of inertias that MuJoCo precomputes
     return bare, lines
 
 
@@ -128,7 +128,7 @@ def _free(model: Any) -> int:
 
 
 def _taken_out(bare: Any, joint: int, load_mass: float) -> list[str]:
-    """Attributes of a free joint or of a slide of the load, with their numbers, that are no longer in `bare`."""
+    """Set the `ACTS` of a joint in `bare` to zero, and describe those that were not."""
     slides, start, place = joint != _free(bare), bare.jnt_dofadr[joint], bare.jnt_qposadr[joint]
     shown = []
     for attribute, arrays in ACTS.items():
@@ -152,26 +152,27 @@ def _taken_out(bare: Any, joint: int, load_mass: float) -> list[str]:
 def check_all_was_named(
     bare: Any, parts: Sequence[Rigid], load: Rigid | None, slides: Sequence[Slide], thrusters: Sequence[Thruster]
 ) -> None:
-    """Raise InputError unless MuJoCo accelerates `bare` as masses and rotors do: the `parts`, and the `load` on slides.
+    """Raise InputError unless `bare` accelerates like `parts` and the `load` on its slides under the rotors' forces.
 
-    Both lie as at the model's start, where the free body's attitude, all velocities and the rotors' forces are drawn.
+    Positions of all parts are those of the model's initial state; the free body's attitude, all velocities and the
+    rotors' forces are random.
     """
     import mujoco
 
-    if not thrusters:  # nothing pushes where the file beside the model tells the rotors
+    if not thrusters:  # the file beside the model gives the rotors
         bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     plain = _plain_model(parts, load, slides, bare.opt.gravity)
     if plain is None:
         return
-    draw, data, own = np.random.default_rng(0), mujoco.MjData(bare), mujoco.MjData(plain)
+    random, data, own = np.random.default_rng(0), mujoco.MjData(bare), mujoco.MjData(plain)
     place, start = bare.jnt_qposadr[_free(bare)], bare.jnt_dofadr[_free(bare)]
     moving = [*range(start, start + 6), *(bare.jnt_dofadr[slide.joint] for slide in slides)]
     weight = sum(part.mass for part in (*parts, *([load] if load else []))) * -bare.opt.gravity[2]
     for _ in range(STATES):
-        turned = draw.normal(size=4)
+        turned = random.normal(size=4)
         own.qpos[3:7] = data.qpos[place + 3 : place + 7] = turned / np.linalg.norm(turned)
-        own.qvel[:] = data.qvel[moving] = draw.normal(size=len(moving))
-        forces = _push(bare, data, thrusters, 2 * weight, draw)
+        own.qvel[:] = data.qvel[moving] = random.normal(size=len(moving))
+        forces = _push(bare, data, thrusters, 2 * weight, random)
         mujoco.mj_forward(bare, data)
         mujoco.mj_fwdPosition(plain, own)
         axes, own.qfrc_applied[:] = own.xmat[1].reshape(3, 3), 0
@@ -189,10 +190,7 @@ def check_all_was_named(
 
 
 def _plain_model(parts: Sequence[Rigid], load: Rigid | None, slides: Sequence[Slide], gravity: Vector) -> Any:
-    """A free body of `parts` with the `load` on `slides`, and nothing else; None for numbers that no rig has.
-
-    The settings' checks name those.
-    """
+    """A model of a free body of `parts` with the `load` on `slides`; None for values that validation refuses later."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -216,13 +214,13 @@ def _plain_model(parts: Sequence[Rigid], load: Rigid | None, slides: Sequence[Sl
 
 
 def _push(
-    bare: Any, data: Any, thrusters: Sequence[Thruster], most: float, draw: np.random.Generator
+    bare: Any, data: Any, thrusters: Sequence[Thruster], most: float, random: np.random.Generator
 ) -> list[tuple[Rotor, float]]:
-    """Set controls of rotors in `data` at random within their limits, of together `most` [N]; the force of each [N]."""
+    """Set random controls of the rotors in `data`, of at most `most` [N] in all; returns (rotor, force [N])."""
     forces = []
     for number, per_input, (low, high), rotor in thrusters:
         least = max(low, 0.0)
-        put = least + draw.uniform() * (max(min(high, most / len(thrusters) / per_input), least) - least)
+        put = least + random.uniform() * (max(min(high, most / len(thrusters) / per_input), least) - least)
         data.ctrl[number] = put
         if bare.actuator_actadr[number] >= 0:
             data.act[bare.actuator_actadr[number]] = put

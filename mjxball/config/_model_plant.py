@@ -1,6 +1,6 @@
-"""The plant of a model: its numbers as settings, and a line for each that the model does not say and that is assumed.
+"""The plant of a model: its values as settings, and a line for each value that it lacks and that is assumed.
 
-What is assumed has the proportions of the reference pair and of the shipped teams.
+Assumed values have the proportions of the reference pair and of the shipped teams.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from mjxball.config._tree import leaves
 from mjxball.errors import InputError
 from mjxball.reading import is_number
 
-ARM = 0.12  # of a drone of 1 kg; goes with the cube root of its mass [m]
+ARM = 0.12  # of a drone of 1 kg, proportional to the cube root of its mass [m]
 SPACING = 0.34 / 0.12  # distance of neighbours over the arm
 THRUST = 5.5 / 9.81  # force of a rotor over the drone's weight
 YAW = 0.02 / 0.12  # yaw moment over force, over the arm
-LOAD, SPARE = 0.1, 0.25  # mass of the object over that of the drones, and at most over what they lift besides
+LOAD, SPARE = 0.1, 0.25  # mass of the object over that of the drones, and at most over their spare lift
 CARRIER = 0.05  # mass of a team's carrier over that of its drones
 WIDTH, HEIGHT, BALL, AMPLITUDE = 0.10 / 0.34, 0.05 / 0.34, 0.02 / 0.34, 0.05 / 0.34  # over the object's length
-SQUARE = 0.3  # of the arm that a rotor may be off a square cross
-SHOWN = 0.01  # of the arm or of the inertia: what is left out beyond it has a line
-LINE = 20.0  # times as far apart along an axis as across it are two drones on a line
-SHARED = ("arm", "rotor_force_max", "rotor_lag", "yaw_per_thrust")  # of a drone, or of all
+SQUARE = 0.3  # largest distance of a rotor from the corner of a square, over the arm
+SHOWN = 0.01  # over the arm or the inertia: larger deviations are reported
+LINE = 20.0  # ratio of spacings along and across an axis from which two drones are on a line
+SHARED = ("arm", "rotor_force_max", "rotor_lag", "yaw_per_thrust")  # settings of one drone or of the plant
 QUARTERS = math.pi / 2 * np.arange(4)
-UNITS = {  # of every setting, behind a blank
+UNITS = {  # of every setting, with a leading blank
     path: f" {unit[1]}" if (unit := re.search(r"\[(.+)\]", item.metadata["about"])) else ""
     for path, _, item in leaves(Config())
 }
@@ -42,67 +42,68 @@ UNITS = {  # of every setting, behind a blank
 
 @dataclass
 class _Settings:
-    """What the model says, and what is assumed where the user has not `said` otherwise."""
+    """Settings found in the model or assumed, unless the user has `given` them."""
 
-    said: Mapping[str, Any]
+    given: Mapping[str, Any]
     found: dict[str, Any] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
     def assume(self, name: str, value: Any, why: str) -> None:
-        """Set plant.`name` or another path and say so, unless the user has."""
+        """Set plant.`name` or another path and add a line, unless the user gave it."""
         path = name if "." in name else f"plant.{name}"
-        if path not in self.said:
+        if path not in self.given:
             self.found[path] = value
             parts = value if isinstance(value, list) else [value]
             shown = ", ".join(part if isinstance(part, str) else f"{part:.3g}" for part in parts)
             self.lines.append(f"assumed {path} {shown}{UNITS[path]}: {why}")
 
     def leave_out(self, what: str) -> None:
-        """Say that the plant has not `what` the model has."""
+        """Add a line that the plant ignores `what`."""
         self.lines.append(f"left out: {what}")
 
     def number(self, name: str) -> float:
-        """plant.`name` as the user says it, unless no plant may have that, else as it was found, or 0."""
-        said, found = self.said.get(f"plant.{name}"), self.found.get(f"plant.{name}", 0.0)
-        return float(said if is_number(said) and said > 0 else found)
+        """plant.`name` as the user gave it, if that is a positive number, else as found, else 0."""
+        value, found = self.given.get(f"plant.{name}"), self.found.get(f"plant.{name}", 0.0)
+        return float(value if is_number(value) and value > 0 else found)
 
 
-def plant_of(model: Model, said: Mapping[str, Any], count: int | None) -> tuple[dict[str, Any], list[str]]:
-    """(settings by dotted path, lines on what is assumed) of `model`; the settings hold the list plant.drones.
+def plant_of(model: Model, given: Mapping[str, Any], count: int | None) -> tuple[dict[str, Any], list[str]]:
+    """(settings by dotted path with the list plant.drones, lines on assumed and ignored values) of `model`.
 
-    `said`: settings of the user, which are not assumed; `count`: how many drones fly if the model is one, None: as many
-    as plant.drones lists, or two. Raises InputError for rotors in no square cross, or a `count` beside a whole rig.
+    `given`: settings of the user, which are not assumed. `count`: number of drones if the model is a single one, None
+    for as many as plant.drones lists, or two. Raises InputError unless rotors form a square, and for a `count` beside a
+    whole rig.
     """
-    settings = _Settings(said)
+    settings = _Settings(given)
     settings.found["plant.gravity"] = model.gravity
     for what in model.left_out:
         settings.leave_out(what)
     turned = _cross(model.drones[0]).first
     settings.found["plant.layout"] = "plus" if abs(turned) < math.pi / 8 else "x"
-    layout = said.get("plant.layout", settings.found["plant.layout"])
+    layout = given.get("plant.layout", settings.found["plant.layout"])
     drones = [_numbers(drone, layout, settings) for drone in model.drones]
     _share(drones, settings)
     if model.carrier is None:
         drones = _repeated(drones[0], count, settings)
-    elif count is not None or "plant.drones" in said:
+    elif count is not None or "plant.drones" in given:
         raise InputError(f"the model is a whole rig of {len(drones)} drones, expected no drones of the file beside it")
     else:
         drones = _placed(drones, model, settings)
     settings.found["plant.drones"] = drones
     _assume_load(drones, model, settings)
-    if not any(path.startswith(("attitude.", "autopilot.", "leader.")) for path in said):
+    if not any(path.startswith(("attitude.", "autopilot.", "leader.")) for path in given):
         settings.lines.append("assumed attitude and leader: loop and gains of the preset")
-    return settings.found, sorted(settings.lines, key=lambda line: line.startswith("warning"))  # these are read last
+    return settings.found, sorted(settings.lines, key=lambda line: line.startswith("warning"))  # warnings are last
 
 
 class _Cross(NamedTuple):
-    """Where a drone's rotors stand, one after the other around it."""
+    """The rotors of a drone, in order of their angle."""
 
-    first: float  # angle of the first from x, -45 to 45 degrees [rad]
-    arm: float  # 0 if it is not known [m]
-    middle: np.ndarray  # (2,) between them [m]
-    off: float  # that they are off the square at most [m]
-    order: np.ndarray  # (4,) their numbers
+    first: float  # angle of the first rotor from x, -45 to 45 degrees [rad]
+    arm: float  # 0: unknown [m]
+    middle: np.ndarray  # (2,) mean of their positions [m]
+    off: float  # largest distance of a rotor from the corner of the square [m]
+    order: np.ndarray  # (4,) indices in the model
 
 
 def _cross(drone: ModelDrone) -> _Cross:
@@ -127,7 +128,7 @@ def _name(drone: ModelDrone) -> str:
 
 
 def _numbers(drone: ModelDrone, layout: str, settings: _Settings) -> dict[str, Any]:
-    """Fields of `config.Drone`, without those that the model does not say; its mount is its centre of mass."""
+    """Fields of `config.Drone` that the model gives; the mount is the centre of mass."""
     cross, rigid = _cross(drone), drone.rigid
     rotors = [drone.rotors[number] for number in cross.order]
     turned = cross.first - (math.pi / 4 if layout == "x" else 0.0)
@@ -164,7 +165,7 @@ def _numbers(drone: ModelDrone, layout: str, settings: _Settings) -> dict[str, A
 
 
 def _principal(inertia: np.ndarray, name: str, settings: _Settings) -> list[float]:
-    """The diagonal of `inertia` (3, 3); what is beside it is left out."""
+    """The diagonal of `inertia` (3, 3); large other elements are reported as ignored."""
     beside = float(np.abs(inertia - np.diag(np.diag(inertia))).max())
     if beside > SHOWN * np.trace(inertia):
         settings.leave_out(f"products of inertia of {name}, up to {beside:.2g} kg m2")
@@ -172,10 +173,10 @@ def _principal(inertia: np.ndarray, name: str, settings: _Settings) -> list[floa
 
 
 def _share(drones: list[dict[str, Any]], settings: _Settings) -> None:
-    """What `SHARED` names: of the plant if the user says so or all drones agree, else of each; the rest is assumed."""
+    """Make `SHARED` settings the plant's if the user gave one or all drones agree; assume those of no drone."""
     for name in SHARED:
         known = [drone[name] for drone in drones if name in drone]
-        if f"plant.{name}" in settings.said or not known or max(known) - min(known) < 1e-9 * max(known):
+        if f"plant.{name}" in settings.given or not known or max(known) - min(known) < 1e-9 * max(known):
             for drone in drones:
                 drone.pop(name, None)
         if known:
@@ -192,8 +193,8 @@ def _share(drones: list[dict[str, Any]], settings: _Settings) -> None:
 
 
 def _repeated(drone: dict[str, Any], count: int | None, settings: _Settings) -> list[Any]:
-    """The model's drone at the mounts that the user lists, or on a ring."""
-    listed = settings.said.get("plant.drones")
+    """The model's drone at the mounts that the user gave, or on a ring."""
+    listed = settings.given.get("plant.drones")
     if isinstance(listed, list):
         if count not in (None, len(listed)):
             raise InputError(f"drones is {count}, expected the {len(listed)} that plant.drones lists")
@@ -212,7 +213,7 @@ def _repeated(drone: dict[str, Any], count: int | None, settings: _Settings) -> 
 
 
 def _placed(drones: list[dict[str, Any]], model: Model, settings: _Settings) -> list[dict[str, Any]]:
-    """The drones of a whole rig from O, the carrier's centre; of a pair on a line the one ahead is first."""
+    """The drones of a whole rig with mounts from O, the carrier's centre; a pair on a line is sorted, front first."""
     carrier, origin = model.carrier, _origin(model)
     assert carrier is not None
     settings.found["plant.carrier_mass"] = carrier.mass
@@ -232,12 +233,12 @@ def _origin(model: Model) -> np.ndarray:
 
 
 def _leave_out_of_load(load: Rigid, origin: np.ndarray, settings: _Settings) -> None:
-    """Say where the load is, which in the plant starts at O, and its inertia, there a ball's or a box's."""
-    size = settings.said.get("plant.object_size", settings.found.get("plant.object_size"))
+    """Report a load that is not at O, or whose inertia is not that of the plant's ball or box."""
+    size = settings.given.get("plant.object_size", settings.found.get("plant.object_size"))
     try:
         x, y, z = (float(edge) for edge in size)
     except (TypeError, ValueError, OverflowError):
-        return  # refused where the settings are checked
+        return  # validation refuses it
     place = load.centre - origin
     if np.abs(place).max() > SHOWN * max(x, y, z):
         shown = " ".join(f"{part:.3g}" for part in place + 0.0)
@@ -252,7 +253,7 @@ def _leave_out_of_load(load: Rigid, origin: np.ndarray, settings: _Settings) -> 
 
 
 def _axis(mounts: list[Any]) -> str:
-    """Along which two drones stand, xy for others."""
+    """The axis along which two drones are mounted, xy for other plants."""
     across = np.ptp(np.array(mounts, dtype=float)[:, :2], axis=0)
     if len(mounts) > 2 or max(across) < LINE * min(across):
         return "xy"
@@ -260,14 +261,14 @@ def _axis(mounts: list[Any]) -> str:
 
 
 def _assume_load(drones: list[Any], model: Model, settings: _Settings) -> None:
-    """The object on the carrier: a bar between two drones on a line, else a plate to the mounts."""
+    """Assume the object: a bar between two drones on a line, else a plate that reaches to the mounts."""
     try:
         rows = [Drone(**one) for one in drones]
         mounts = [tuple(map(float, row.mount)) for row in rows]
         masses = [float(row.mass) for row in rows]
         forces = [float(row.rotor_force_max or settings.number("rotor_force_max")) for row in rows]
     except (TypeError, ValueError, OverflowError):
-        return  # refused where the settings are checked, as mounts that are none
+        return  # validation refuses it, as mounts that are none
     if not all(len(mount) == 3 and all(map(math.isfinite, mount)) for mount in mounts):
         return
     if model.load is None:
@@ -279,7 +280,7 @@ def _assume_load(drones: list[Any], model: Model, settings: _Settings) -> None:
         settings.assume("object_mass", float(f"{mass:.4g}"), why)
     else:
         settings.found["plant.object_mass"], settings.found["plant.cg_axis"] = model.load[0].mass, model.load[1]
-    axis = str(settings.said.get("plant.cg_axis", settings.found.get("plant.cg_axis")))
+    axis = str(settings.given.get("plant.cg_axis", settings.found.get("plant.cg_axis")))
     if len(axis) == 1:
         along = [mount["xy".index(axis) if axis in "xy" else 0] for mount in mounts]
         length = float(np.ptp(along)) or SPACING * settings.number("arm")

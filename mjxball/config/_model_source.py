@@ -1,4 +1,4 @@
-"""A model for MuJoCo, compiled: MJCF as it is, a URDF with a base that flies. Needs MuJoCo."""
+"""Check and compile a model: MJCF as it is, a URDF with a free base. Needs MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from mjxball.errors import InputError
 from mjxball.files import read_text
 
 XACRO = ".xacro"
-MODELS = (".xml", ".urdf", XACRO)  # endings of the files
-MAX_MODEL = 2**20  # bytes of a model, and of one that it includes
+MODELS = (".xml", ".urdf", XACRO)  # suffixes of model files
+MAX_MODEL = 2**20  # bytes of a model, or of one that it includes
 MAX_ASSET = 2**26  # bytes of a mesh or texture
-MAX_ELEMENTS = 5000  # of XML; MuJoCo takes seconds for more
+MAX_ELEMENTS = 5000  # XML elements; MuJoCo takes seconds for more
 MAX_PIXELS = 2**22  # of all height fields and textures of a model
 UNEXPANDED = "it is a xacro file, expand it with xacro first: xacro FILE.xacro > FILE.urdf"
-LONGEST = 200  # characters of a name or a message that a sentence shows
+LONGEST = 200  # characters of a name or a message in an error message
 FIRST = re.compile(r"(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-COUNTS = re.compile(r"count|nrow|ncol|nsample|nkey|nuser\w*")  # attributes: how many there are
-FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; URDF's shapes do not matter
-MACRO = re.compile(r"\$\$?[{(]")  # of xacro, in an attribute
-ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # in the name of a URDF's link
+COUNTS = re.compile(r"count|nrow|ncol|nsample|nkey|nuser\w*")  # attributes that count elements
+FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; shapes of a URDF are not used
+MACRO = re.compile(r"\$\$?[{(]")  # a xacro expression in an attribute
+ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # names of a URDF's links
 
 
 def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, bool]:
-    """(model, data at its start, whether it is a URDF) of the `text` in `path`; InputError for what does not compile.
+    """(model, data in its initial state, whether it is a URDF) of the `text` in `path`; InputError if MuJoCo fails.
 
-    Of a URDF joints of links that `rotors` names are fixed; if it names none, of those that are called like rotors.
+    In a URDF the joints of the links `rotors` are fixed, or if that is empty, of all links with names of rotors.
     """
     import mujoco
 
@@ -47,7 +47,7 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
     _Check(path, text)
     try:
-        with heard() as said_so:
+        with captured_warnings() as caught:
             spec = mujoco.MjSpec.from_file(str(path))
             if first == "robot":
                 _free(spec, rotors)
@@ -62,14 +62,14 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
         if "mjMINVAL" in said:
             raise InputError("a body that moves has no mass or no inertia, expected both above 0") from None
         raise InputError(f"MuJoCo does not compile it: {said}") from None
-    if any("NaN" in warning for warning in said_so):
+    if any("NaN" in warning for warning in caught):
         raise InputError("a number of it is NaN, expected numbers")
     return model, data, first == "robot"
 
 
 @contextlib.contextmanager
-def heard() -> Iterator[list[str]]:
-    """MuJoCo's warnings, which else go to a file in the current directory; not those of its compiler, on stderr."""
+def captured_warnings() -> Iterator[list[str]]:
+    """MuJoCo's warnings, which would go to a file in the current directory; those of its compiler are dropped."""
     import mujoco
 
     said: list[str] = []
@@ -84,7 +84,7 @@ def heard() -> Iterator[list[str]]:
 
 
 def _free(spec: Any, rotors: Collection[str]) -> None:
-    """Let a URDF's base fly; its links have the mass of their <inertial>, and shapes do not matter."""
+    """Make the base of a URDF free, with masses from <inertial> alone, without shapes."""
     import mujoco
 
     spec.compiler.fusestatic = False
@@ -107,7 +107,7 @@ def _free(spec: Any, rotors: Collection[str]) -> None:
     for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
         carried = {joint.parent.name, *(body.name for body in joint.parent.find_all("body"))}
         if joint.parent.name != base.name and not any(b.mass for b in spec.bodies if b.name not in carried):
-            # Below a frame such as odom, which MuJoCo takes for a body that carries it.
+            # Below a frame such as odom, which is a body to MuJoCo.
             base.add_joint(
                 name=f"{joint.name} ", type=joint.type, damping=joint.damping, frictionloss=joint.frictionloss
             )
@@ -119,18 +119,18 @@ def _free(spec: Any, rotors: Collection[str]) -> None:
 
 
 class _Check:
-    """What the text of a model asks of MuJoCo, before MuJoCo reads it: InputError if that is too much.
+    """Limits on the text of a model, checked before MuJoCo reads it.
 
-    Raised for elements, once repeated, included and attached, beyond `MAX_ELEMENTS`, pictures beyond `MAX_PIXELS`, and
-    files that are missing, larger than they may be, or none, such as a pipe, for which MuJoCo would wait.
+    Raises InputError for more than `MAX_ELEMENTS` elements, after repetition, inclusion and attachment, more than
+    `MAX_PIXELS` of pictures, and files that are missing, too large, or no files, such as a pipe, on which MuJoCo waits.
     """
 
     def __init__(self, path: Path, text: str, around: _Check | None = None):
-        """`around`: of the model to which that in `path` may be attached."""
+        """`around`: the check of the model to which the one in `path` may be attached."""
         self.elements, self.attached, self.largest, self.points, self.times = 0.0, 0.0, 0.0, 0.0, [1.0]
         self.read, self.parents, self.folders = {path.resolve()}, [path.parent], [""]
         self.parents += around.parents if around else []
-        self.models: dict[Path, float] = around.models if around else {}  # elements of those that may be attached
+        self.models: dict[Path, float] = around.models if around else {}  # elements of models that may be attached
         self.files: list[tuple[str, str]] = []
         self._text(text)
         self._count(self.attached * self.largest)
@@ -141,7 +141,7 @@ class _Check:
         parser = expat.ParserCreate()
         parser.StartElementHandler, parser.EndElementHandler = self._begin, lambda name: self.times.pop()
         try:
-            # MuJoCo allows -- in a comment, and blanks before the declaration.
+            # MuJoCo allows -- in comments and blanks before the declaration.
             parser.Parse(COMMENT.sub("", text).lstrip(" \t\r\n"), True)
         except expat.ExpatError as error:
             raise InputError(f"it is no well-formed XML: {error}") from None
@@ -174,9 +174,9 @@ class _Check:
                 self._text(read_text(place, name, MAX_MODEL))
 
     def _model(self, place: Path) -> None:
-        """One that is attached where <attach> says."""
+        """Check a model that <attach> may attach, and keep its number of elements."""
         if place.resolve() not in self.models:
-            self.models[place.resolve()] = math.inf  # attached in itself
+            self.models[place.resolve()] = math.inf  # for a model that attaches itself
             self.models[place.resolve()] = _Check(place, read_text(place, "model", MAX_MODEL), self).elements
         elements = self.models[place.resolve()]
         self._count(elements)
@@ -193,7 +193,7 @@ class _Check:
             raise InputError(f"it has more than {MAX_ELEMENTS} elements, repeated and included ones among them")
 
     def _file(self, kind: str, name: str, limit: int) -> Path:
-        """Where the file `name` of at most `limit` bytes is, with its folders or, as for `strippath`, without."""
+        """The path of the file `name`, with its folders or without (`strippath`); InputError beyond `limit` bytes."""
         names = (name, Path(name).name)
         places = [
             parent / folder / one for parent in self.parents for folder in reversed(self.folders) for one in names
@@ -215,7 +215,7 @@ class _Check:
 def _number(word: str) -> float:
     try:
         return float(word)
-    except ValueError:  # MuJoCo says so
+    except ValueError:  # MuJoCo reports it
         return 1.0
 
 
@@ -224,5 +224,5 @@ def _is_rotor(name: str, rotors: Collection[str]) -> bool:
 
 
 def printable(text: str) -> str:
-    """`text` of a stranger's file in one line, of a long one the beginning."""
+    """The printable characters of `text` in one line, shortened."""
     return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())[:LONGEST]

@@ -1,4 +1,4 @@
-"""Refuse plants whose proportions no rig has: one of their numbers is probably in another unit."""
+"""Refuse plants with implausible proportions, where a number is probably in a wrong unit."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
 
-MOST_THRUST = 100.0  # times the weight; racing drones have 15
-WRONG_UNIT = 0.5  # below it a plant is not only too weak
-MOST_GRAVITY = 30.0  # [m/s2], a little more than Jupiter's
-YAW_OF_ARM = 10.0  # yaw torque per thrust over the arm; shipped plants have 0.13 to 0.17
-LONGEST_LAG = 1.0  # [s] of any rotor
+MOST_THRUST = 100.0  # thrust over weight; racing drones have 15
+WRONG_UNIT = 0.5  # thrust over weight below which a wrong unit is likelier than a weak plant
+MOST_GRAVITY = 30.0  # [m/s2]; Jupiter has 25
+YAW_OF_ARM = 10.0  # yaw moment per force over the arm; shipped plants have 0.13 to 0.17
+LONGEST_LAG = 1.0  # time constant of a rotor [s]
 ARM_OF_SPACING = 1.0  # arm over the distance to the nearest drone; shipped plants have 0.15 to 0.43
 GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0.4 to 0.9
 CARRIER_OF_REACH = 3.0  # the carrier's radius of gyration over its own reach; shipped plants have 0.5
 SIZE_OF_REACH = 20.0  # longest edge of the object over the farthest mount; shipped plants have 1 to 2
-LONGEST_ERROR = 20.0  # [s] time constant of the slowest pole under the leader's law; shipped presets have 0.6 to 3
-FASTEST = 0.5  # natural frequency times physics step, beyond which the sampled loop has too little phase
+LONGEST_ERROR = 20.0  # time constant of the leader's slowest pole [s]; shipped presets have 0.6 to 3
+INERTIA_UNITS = {"g mm2": 1e-9, "g cm2": 1e-7, "kg mm2": 1e-6, "g m2": 1e-3}  # [kg m2]
+FASTEST = 0.5  # natural frequency times physics step; beyond it sampling takes too much phase
 
 
 def thrust_over_weight(plant: Plant, object_mass: float | None = None) -> float:
-    """Largest force of all rotors over the weight of all, with the plant's object or one of `object_mass` [kg]."""
+    """Largest force of all rotors over the weight, with the plant's object or one of `object_mass` [kg]."""
     force = 4 * sum(plant.of_drones("rotor_force_max"))
     return force / (plant.gravity * total_mass(plant, object_mass))
 
@@ -38,11 +39,11 @@ def total_mass(plant: Plant, object_mass: float | None = None) -> float:
 
 
 def check_units(config: Config) -> None:
-    """Raise InputError for proportions that no rig has; the sentence says which unit was probably meant.
+    """Raise InputError for implausible proportions; the sentence names the unit that was probably meant.
 
-    Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw torque over arm, object over
-    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the loop
-    that the leader's law closes around it.
+    Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw moment over arm, object over
+    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the
+    stability of the leader's position loop.
     """
     plant = config.plant
     if plant.gravity > MOST_GRAVITY:
@@ -59,51 +60,43 @@ def check_units(config: Config) -> None:
 
 
 def _meant(value: float, unit: str, base: str, cured: bool = True) -> str:
-    """What `value` would be if it were given in thousandths of `base`; nothing if that would not be `cured`."""
+    """The hint that `value` was given in thousandths of `base`; empty unless that would be `cured`."""
     return f"; {value:g} {unit} would be {value / 1000:g} {base}" if cured else ""
 
 
+def _refuse_above(most: float, value: float, unit: str, name: str, what: str) -> None:
+    """Raise InputError, with a hint at thousandths of `unit`, if `value` is more than `most`."""
+    if value > most:
+        raise InputError(f"{name} {value:g} {unit} is {what}{_meant(value, f'm{unit}', unit, value / 1000 <= most)}")
+
+
 def _check_sizes(plant: Plant) -> None:
-    mounts = [drone.mount for drone in plant.drones]
-    for number, (arm, mount) in enumerate(zip(plant.of_drones("arm"), mounts, strict=True)):
+    mounts, arms = [drone.mount for drone in plant.drones], plant.of_drones("arm")
+    for number, (arm, mount) in enumerate(zip(arms, mounts, strict=True)):
         nearest = min(math.dist(mount, other) for other in mounts if other is not mount)
-        if arm > ARM_OF_SPACING * nearest:
-            hint = _meant(arm, "mm", "m", arm / 1000 <= ARM_OF_SPACING * nearest)
-            raise InputError(
-                f"{_place(plant, number, 'arm')} {arm:g} m is longer than the {nearest:.3g} m to the next drone{hint}"
-            )
-    yaws = zip(plant.of_drones("arm"), plant.of_drones("yaw_per_thrust"), strict=True)
-    for number, (arm, yaw) in enumerate(yaws):
-        if yaw > YAW_OF_ARM * arm:
-            hint = _meant(yaw, "mm", "m", yaw / 1000 <= YAW_OF_ARM * arm)
-            raise InputError(
-                f"{_place(plant, number, 'yaw_per_thrust')} {yaw:g} m is more than {YAW_OF_ARM:g} times the arm of "
-                f"{arm:g} m{hint}"
-            )
-    reach, longest = max(math.hypot(*mount) for mount in mounts), max(plant.object_size)
-    if longest > SIZE_OF_REACH * reach:
-        hint = _meant(longest, "mm", "m", longest / 1000 <= SIZE_OF_REACH * reach)
-        raise InputError(
-            f"plant.object_size {longest:g} m is more than {SIZE_OF_REACH:g} times the {reach:.3g} m at which drones "
-            f"are mounted{hint}"
-        )
+        what = f"longer than the {nearest:.3g} m to the next drone"
+        _refuse_above(ARM_OF_SPACING * nearest, arm, "m", _place(plant, number, "arm"), what)
+    for number, (arm, yaw) in enumerate(zip(arms, plant.of_drones("yaw_per_thrust"), strict=True)):
+        what = f"more than {YAW_OF_ARM:g} times the arm of {arm:g} m"
+        _refuse_above(YAW_OF_ARM * arm, yaw, "m", _place(plant, number, "yaw_per_thrust"), what)
+    reach = max(math.hypot(*mount) for mount in mounts)
+    what = f"more than {SIZE_OF_REACH:g} times the {reach:.3g} m at which drones are mounted"
+    _refuse_above(SIZE_OF_REACH * reach, max(plant.object_size), "m", "plant.object_size", what)
 
 
 def _check_lags(plant: Plant) -> None:
     for number, lag in enumerate(plant.of_drones("rotor_lag")):
-        if lag > LONGEST_LAG:
-            hint = _meant(lag, "ms", "s", lag / 1000 <= LONGEST_LAG)
-            raise InputError(f"{_place(plant, number, 'rotor_lag')} {lag:g} s is more than {LONGEST_LAG:g} s{hint}")
+        _refuse_above(LONGEST_LAG, lag, "s", _place(plant, number, "rotor_lag"), f"more than {LONGEST_LAG:g} s")
 
 
 def _check_weight(config: Config) -> None:
-    """A plant lifts its own object and the heaviest that is drawn."""
+    """The plant lifts its own object and the heaviest that the scenario samples."""
     for mass in (config.plant.object_mass, config.scenario.object_mass[1]):
         check_lift(config, mass)
 
 
 def check_lift(config: Config, mass: float) -> None:
-    """Raise InputError unless the plant lifts an object of `mass` [kg]; on a pivot nothing is lifted."""
+    """Raise InputError unless the plant lifts an object of `mass` [kg], or stands on a pivot."""
     plant, force = config.plant, 4 * sum(config.plant.of_drones("rotor_force_max"))
     if plant.stand == "pivot":
         return
@@ -118,7 +111,7 @@ def check_lift(config: Config, mass: float) -> None:
 
 
 def _stronger(plant: Plant, mass: float) -> Iterator[str]:
-    """Which masses were probably given in grams, or forces in kN: those that alone in SI units let the plant fly."""
+    """Hints at masses in grams or forces in kN: each change of units by which alone the plant would fly."""
     light = replace(plant, drones=tuple(replace(drone, mass=drone.mass / 1000) for drone in plant.drones))
     heaviest, force = max(drone.mass for drone in plant.drones), max(plant.of_drones("rotor_force_max"))
     sound = all(_gyrates(drone, arm) for drone, arm in zip(light.drones, light.of_drones("arm"), strict=True))
@@ -148,40 +141,39 @@ def _gyrates(drone: Drone, arm: float) -> bool:
     return GYRATION[0] <= math.sqrt(max(drone.inertia) / drone.mass) / arm <= GYRATION[1]
 
 
+def _inertia_fault(
+    name: str, inertia: float, mass: float, beside: str, length: float, usual: tuple[float, float], *units: str
+) -> str:
+    """The sentence that `inertia` does not fit `mass`, with a hint at a unit of `usual` gyration over length."""
+    radius, hint = math.sqrt(inertia / mass), ""
+    for unit in units:
+        if usual[0] <= math.sqrt(INERTIA_UNITS[unit]) * radius / length <= usual[1]:
+            hint = f"; {inertia:g} {unit} would be {inertia * INERTIA_UNITS[unit]:.3g} kg m2"
+    return (
+        f"{name} {inertia:g} kg m2 with {mass:g} kg makes a radius of gyration of {radius:.3g} m beside {beside} of "
+        f"{length:.3g} m{hint}"
+    )
+
+
 def _check_inertia(plant: Plant) -> None:
     for number, (drone, arm) in enumerate(zip(plant.drones, plant.of_drones("arm"), strict=True)):
-        if _gyrates(drone, arm):
-            continue
-        radius = math.sqrt(max(drone.inertia) / drone.mass)
-        hint = ""
-        for unit, factor in (("g mm2", 1e-9), ("g cm2", 1e-7), ("kg mm2", 1e-6), ("g m2", 1e-3)):
-            if 0.2 <= math.sqrt(max(drone.inertia) * factor / drone.mass) / arm <= 2.0:
-                hint = f"; {max(drone.inertia):g} {unit} would be {max(drone.inertia) * factor:.3g} kg m2"
-        raise InputError(
-            f"plant.drones.{number}.inertia {max(drone.inertia):g} kg m2 with {drone.mass:g} kg makes a radius of "
-            f"gyration of {radius:.3g} m beside an arm of {arm:g} m{hint}; check mass, inertia and arm"
-        )
+        if not _gyrates(drone, arm):
+            name, largest = f"plant.drones.{number}.inertia", max(drone.inertia)
+            fault = _inertia_fault(name, largest, drone.mass, "an arm", arm, (0.2, 2.0), *INERTIA_UNITS)
+            raise InputError(f"{fault}; check mass, inertia and arm")
 
 
 def _check_carrier(plant: Plant) -> None:
-    """The carrier's mass is not farther out than the farthest mount or edge, with some to spare."""
-    if not plant.carrier_mass:
-        return
-    largest, reach = max(plant.carrier_inertia), max(*plant.object_size, *(math.hypot(*d.mount) for d in plant.drones))
-    radius = math.sqrt(largest / plant.carrier_mass)
-    if radius > CARRIER_OF_REACH * reach:
-        hint = ""
-        for unit, factor in (("g cm2", 1e-7), ("g m2", 1e-3)):
-            if 0.1 <= math.sqrt(largest * factor / plant.carrier_mass) / reach <= 1.5:
-                hint = f"; {largest:g} {unit} would be {largest * factor:.3g} kg m2"
-        raise InputError(
-            f"plant.carrier_inertia {largest:g} kg m2 with {plant.carrier_mass:g} kg makes a radius of gyration of "
-            f"{radius:.3g} m beside a reach of {reach:.3g} m{hint}"
-        )
+    """The carrier's radius of gyration is not much larger than the distance of its farthest mount or edge."""
+    reach = max(*plant.object_size, *(math.hypot(*drone.mount) for drone in plant.drones))
+    largest, mass = max(plant.carrier_inertia), plant.carrier_mass
+    if mass and math.sqrt(largest / mass) > CARRIER_OF_REACH * reach:
+        units = ("g cm2", "g m2")
+        raise InputError(_inertia_fault("plant.carrier_inertia", largest, mass, "a reach", reach, (0.1, 1.5), *units))
 
 
 def _check_loop(config: Config) -> None:
-    """The attitude loop is stable with the rotors' lag, slower than its steps, faster than the leader's loop."""
+    """The attitude loop is stable with the rotors' lag, slow beside its steps, and faster than the leader's loop."""
     loop, lag, step = config.attitude, max(config.plant.of_drones("rotor_lag")), config.physics_step
     slowest = math.sqrt(max(config.leader.kp[:2]))
     for axis, frequency in zip(("roll", "pitch", "yaw"), loop.natural_frequency, strict=True):
@@ -203,16 +195,16 @@ def _check_loop(config: Config) -> None:
 
 
 def _check_leader(config: Config) -> None:
-    """The leader's law and the attitude loop below it are stable together, and forget an error in time.
+    """The leader's position loop around the attitude loop is stable, and errors decay in time.
 
-    Poles of the object that hovers: what a tilt moves it by is gravity's, what thrust lifts it by the rotors'. An
-    integral is slow where it is small: stability counts with it, speed without.
+    Checked are the poles at hover: horizontal motion by gravity's share at a tilt, vertical motion by thrust with the
+    rotors' lag. A small integral gain makes a slow pole, so decay is checked without the integral.
     """
     law, loop, lag = config.leader, config.attitude, max(config.plant.of_drones("rotor_lag"))
     free = config.plant.stand == "free"
     ways = {"x": (0, "pitch"), "y": (1, "roll")} if free else {}
     ways |= {"z": (2, "")} if config.plant.stand != "pivot" else {}
-    slowest = 1 / LONGEST_ERROR if free else 0.0  # the paper's stand sinks back within a minute
+    slowest = 1 / LONGEST_ERROR if free else 0.0  # the paper's stand takes a minute
     for axis, (place, turned) in ways.items():
         bottom: list[float] = [lag, 1.0]
         below = "rotors"

@@ -8,8 +8,8 @@ from dataclasses import replace
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant_file import read_plant
-from mjxball.config._rigs import Rigs
-from mjxball.config._settings import Attitude, Bounds, Command, Config, Follower, Reward, ScenarioRanges
+from mjxball.config._scenario import Rigs, ScenarioRanges
+from mjxball.config._settings import Attitude, Bounds, Command, Config, Follower, Reward
 from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 
@@ -19,7 +19,7 @@ def _paper() -> Config:
         preset="paper",
         follower=Follower(action="direct", action_scale_tilt=0.6, action_scale_vertical=6.0, ignore_position=False),
         reward=Reward(kind="paper", termination=0.0),
-        # Its reward asks for the leader's command, which sways by 0.30 m and settles nowhere.
+        # The reward is for the leader's command, under which the object sways by 0.30 m and does not settle.
         bounds=Bounds(x_peak=0.36, settling_time=0.0, rmse=0.55, action_error=0.02),
         sac=Sac(
             total_steps=1_000_000,
@@ -54,7 +54,7 @@ def _transport() -> Config:
             start_tilt=0.05,
         ),
         reward=Reward(error_scale=0.05),
-        # The loss is nearly without noise: with less momentum two thirds of the steps do.
+        # The loss has little noise: with less momentum two thirds of the steps suffice.
         gradient=Gradient(gradient_steps=80, learning_rate=2.5e-2, adam_betas=(0.7, 0.99)),
         sac=Sac(
             total_steps=768_000,
@@ -72,7 +72,7 @@ def _transport() -> Config:
 
 
 def _large() -> Config:
-    """What larger trainings share: all loads that one drone can trim, a little of everything late and noisy."""
+    """Common to larger trainings: all loads that one drone can trim, with little noise and delay."""
     return Config(
         follower=Follower(action_scale_tilt=0.3, observation_averages=(0.05, 0.2), privileged_critic=True),
         scenario=ScenarioRanges(
@@ -81,19 +81,19 @@ def _large() -> Config:
             object_mass=(0.1, 0.6),
             start_velocity=0.2,
             start_tilt=0.05,
-            # Without it the command chatters between its limits.
+            # Without noise the command chatters between its limits.
             noise=(0.0, 1.0),
             delay=(0.0, 0.04),
             rotor_lag_scale=(0.7, 1.4),
         ),
         bounds=Bounds(x_peak=0.015, settling_time=2.8, rmse=0.345),
-        # Speed is dear so that the goal is not overshot, changes of the command so that noise ends before the rotors.
+        # The weight of speed prevents overshoot, that of changes of the command keeps noise from the rotors.
         reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
         sac=replace(LARGE_SAC, total_steps=2_048_000, discount=0.97, n_step=5, learning_rate=3e-3),
     )
 
 
-# What flies through a termination counts: its gradient is limited in every environment.
+# A window may pass through a termination, so the gradient is limited in every environment.
 RECURRENT_GRADIENT = Gradient(
     windows_per_episode=(3,),
     learning_rate=6e-3,
@@ -102,12 +102,12 @@ RECURRENT_GRADIENT = Gradient(
     gradient_decay=0.97,
     state_gradient_clip=1e4,
 )
-# A network that remembers, beside the PD law alone: no averages, no estimator.
+# A recurrent network added to the PD controller, without averages of observations.
 RECURRENT = Follower(previous_action=True, recurrent_units=64)
 
 
 def _balance() -> Config:
-    """One follower for loads known and unknown: a recurrent network that is trained by gradients."""
+    """One follower for known and unknown loads: a recurrent network trained by first-order gradients."""
     large = _large()
     return replace(
         large,
@@ -121,25 +121,25 @@ def _balance() -> Config:
         ),
         scenario=replace(
             large.scenario,
-            # Faster loads than users are promised, and loads beyond what one drone trims: nothing is met unprepared.
+            # Faster loads than documented, and loads beyond what one drone trims, as a margin.
             cg_speed=(0.2, 3.5),
             trim_margin=-0.15,
             unknown_mass_probability=0.4,
             unknown_mass=(0.1, 0.4),
             gust=(0.0, 0.2),
-            # Twice what a user's delay may be: what is stable there is well damped at 60 ms.
+            # Twice the documented delay: a loop that is stable there is well damped at 60 ms.
             delay=(0.0, 0.13),
-            calm_probability=0.5,  # noise hides millimetres
+            calm_probability=0.5,  # noise hides errors of millimetres
             rotor_lag_scale=(0.7, 1.5),
             inertia_scale=(0.8, 1.2),
             cg_waypoint_probability=0.3,
         ),
         bounds=Bounds(x_peak=0.005, settling_time=2.2, rmse=0.335),
-        # Speed is so dear that no seed overshoots by the 2 % within which it is to settle.
+        # With this weight of speed no seed overshoots by the 2 % that count as settled.
         reward=replace(
             large.reward, error=0.25, error_scale=0.004, velocity=12.0, smoothness=0.2, command_change=110.0
         ),
-        # Large batches: with 1024 transitions, and four times as many updates, commands chatter.
+        # With batches of 1024 transitions and four times as many updates commands chatter.
         sac=replace(
             large.sac,
             total_steps=6_144_000,
@@ -158,7 +158,7 @@ def _balance() -> Config:
             policy_layers=(32,),
             horizon=200,
             gradient_decay=0.98,
-            # Circles of millimetres hardly cost anything: the last quarter damps what is infinitely small.
+            # The reward hardly sees circles of millimetres: the last quarter of training damps them.
             impulse_response=0.02,
         ),
     )
@@ -168,7 +168,7 @@ TEAM_GRADIENT = replace(RECURRENT_GRADIENT, policy_layers=(48,), horizon=150)
 
 
 def _team() -> Config:
-    """Two to six drones on a ring, one policy for all followers of all teams; the load moves in the plane."""
+    """Two to six drones on a ring with one policy for all followers; the load moves in the plane."""
     large = _large()
     return replace(
         apply_overrides(large, read_plant("team6").settings),
@@ -209,7 +209,7 @@ def _team() -> Config:
 
 
 def _lost() -> Config:
-    """Six drones of which one may be lost; the followers hold most of the load by lifting apart."""
+    """Six drones of which one follower may fail; the followers hold most of the load by different lift."""
     team = _team()
     return replace(
         team,
@@ -224,14 +224,14 @@ def _lost() -> Config:
 
 
 def _universal() -> Config:
-    """One follower for teams of any drones and loads, told where they are mounted alone."""
+    """One follower for teams of any drones and loads, which knows only where drones are mounted."""
     large = _large()
     team = apply_overrides(large, read_plant("team6").settings)
     return replace(
         team,
         preset="universal",
         plant=replace(team.plant, rotor_lag=0.04),
-        # In the middle of what rigs are drawn with.
+        # In the middle of the range of random rigs.
         attitude=Attitude(natural_frequency=(7.0, 7.0, 3.0), damping=0.8, design_object_mass=0.4),
         command=Command(tilt_limit=0.6, vertical_limit=8.0),
         follower=replace(RECURRENT, recurrent_units=60, action_scale_tilt=0.6, action_scale_vertical=8.0),
@@ -252,7 +252,7 @@ def _universal() -> Config:
         reward=replace(_team().reward, rates=0.5),
         sac=replace(large.sac, num_envs=528, replay_size=528_000),
         ppo=Ppo(num_envs=528),
-        # For a GPU. With short flights alone followers drift against each other, with long ones alone they settle late.
+        # For a GPU. Short flights alone let followers drift against each other, long ones alone let them settle late.
         gradient=replace(TEAM_GRADIENT, num_envs=1100, gradient_steps=2600, windows_per_episode=(3, 12)),
     )
 
@@ -266,7 +266,7 @@ PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
 
 
 def preset(name: str) -> Config:
-    """Return the named preset; raise InputError for an unknown name."""
+    """The preset `name`; InputError for an unknown one."""
     if name not in PRESETS:
         raise InputError(f"unknown preset {name!r}; choose from {', '.join(PRESETS)}")
     return PRESETS[name]

@@ -1,9 +1,8 @@
-"""Refuse configurations that make no sense, in one sentence."""
+"""Validation: types, bounds, and relations between settings. Every refusal is an InputError of one sentence."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
 import typing
@@ -16,39 +15,41 @@ from mjxball.config._tree import leaves
 from mjxball.errors import InputError
 from mjxball.reading import SMALLEST, is_number, shown
 
-MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
+MOST_DRONES = 16  # of a plant
+FARTHEST = 10.0  # distance of a mount from O [m]
+APART = 1e-3  # least distance of two drones [m]
+THRUST_MARGIN = 0.2  # least share of a Crazyflie's thrust that hovering leaves
 
 
-@functools.cache
-def _types_of(kind: Any) -> dict[str, Any]:
-    return typing.get_type_hints(kind)
+def check_leaves(config: Config) -> None:
+    """Raise InputError unless every setting has its type and lies within its bounds."""
+    for path, value, item in leaves(config):
+        _check_leaf(path, value, item)
 
 
-def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> None:
-    if typing.get_origin(hint) is Literal:
-        if value not in typing.get_args(hint):
-            allowed = " or ".join(str(choice) for choice in typing.get_args(hint))
-            raise InputError(f"{path} must be {allowed}, not {shown(value)}")
-        return
-    if hint is bool:
+def _check_leaf(path: str, value: Any, item: dataclasses.Field) -> None:
+    kind: Any = item.type
+    kinds = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        if value not in kinds:
+            raise InputError(f"{path} must be {' or '.join(kinds)}, not {shown(value)}")
+    elif kind is bool:
         if not isinstance(value, bool):
             raise InputError(f"{path} must be true or false, not {shown(value)}")
-        return
-    if typing.get_origin(hint) is not tuple:
-        _check_number(path, value, hint, item.metadata)
-        return
-    kinds = typing.get_args(hint)
-    if not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
+    elif typing.get_origin(kind) is not tuple:
+        _check_number(path, value, kind, item.metadata)
+    elif not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
         count = "several" if Ellipsis in kinds else str(len(kinds))
         raise InputError(f"{path} takes {count} numbers, not {shown(value)}")
-    if not value and item.default:
+    elif not value and item.default:
         raise InputError(f"{path} must hold at least one number")
-    if len(value) > item.metadata["most"]:
+    elif len(value) > item.metadata["most"]:
         raise InputError(f"{path} takes at most {item.metadata['most']:,} numbers, not {len(value):,}")
-    for number in value:
-        _check_number(path, number, kinds[0], item.metadata)
-    if item.metadata["ordered"] and value[0] > value[1]:
-        raise InputError(f"{path} must be low,high with low <= high, not {value[0]:g},{value[1]:g}")
+    else:
+        for number in value:
+            _check_number(path, number, kinds[0], item.metadata)
+        if item.metadata["ordered"] and value[0] > value[1]:
+            raise InputError(f"{path} must be low,high with low <= high, not {value[0]:g},{value[1]:g}")
 
 
 def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
@@ -61,18 +62,8 @@ def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
         raise InputError(f"{path} must be 0 or at least {SMALLEST:g} in size, not {shown(number)}")
 
 
-def check_leaves(config: Config) -> None:
-    """Raise InputError unless every setting is of its type and within its own bounds."""
-    for path, value, item in leaves(config):
-        owner: Any = config
-        for part in path.split(".")[:-1]:
-            owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
-        kind: Any = type(owner)  # hashable, which no type checker knows of `type[Any]`
-        _check_leaf(path, value, item, _types_of(kind)[item.name])
-
-
 def validate(config: Config) -> Config:
-    """Return `config` if every leaf and every relation between leaves is sound, else raise InputError."""
+    """Return `config` if every setting and every relation between settings is valid, else raise InputError."""
     check_leaves(config)
     _validate_plant(config.plant)
     check_units(config)
@@ -105,9 +96,6 @@ def validate(config: Config) -> Config:
     if config.sac.replay_size % config.sac.num_envs:
         raise InputError("sac.replay_size must be a multiple of sac.num_envs")
     return config
-
-
-APART = 1e-3  # [m] by which two drones' centres must differ
 
 
 def _validate_plant(plant: Plant) -> None:
@@ -150,7 +138,7 @@ def _validate_plant(plant: Plant) -> None:
 
 
 def _validate_team(config: Config) -> None:
-    """What is for teams, and what is for pairs alone."""
+    """Settings that need a team, and those that need a pair."""
     plant, scenario = config.plant, config.scenario
     if config.follower.residual_on_pid and plant.count > 2:
         raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")
@@ -178,11 +166,8 @@ def _validate_team(config: Config) -> None:
         )
 
 
-THRUST_MARGIN = 0.2  # share of a Crazyflie's thrust that a hover must leave
-
-
 def thrust_margin(config: Config) -> float:
-    """Share of the weaker drone's full thrust that hovering the heaviest object leaves; negative: it cannot hover."""
+    """Share of full thrust that hovering with the heaviest object leaves the most loaded drone; negative: too heavy."""
     plant, most = config.plant, 4 * sum(config.autopilot.motor_curve)
     mass = config.scenario.object_mass[1] + max(config.scenario.mass_change[1], 0.0)
     carried = (own + share * mass for own, share in zip(plant.known_masses, plant.load_shares, strict=True))

@@ -69,8 +69,7 @@ class FollowerLaw(NamedTuple):
         xp = observation.__array_namespace__()
         parts = [remembered, *[xp.zeros_like(observation[..., :1])] * self.units]
         if self.geometry:
-            known = xp.asarray(geometry, dtype=observation.dtype)
-            parts.append(xp.broadcast_to(known, (*observation.shape[:-1], GEOMETRY_SIZE)))
+            parts.append(xp.zeros_like(observation[..., :1]) + xp.asarray(geometry, dtype=observation.dtype))
         return xp.concat(parts, axis=-1)
 
     def network_input(self, observation: Array, memory: Array) -> Array:

@@ -1,10 +1,11 @@
-"""The policy file: one `.npz` without pickles (docs/policy-file.md). Reading verifies everything it uses."""
+"""The policy file: one `.npz` without pickles (docs/policy-file.md). All contents are checked when it is read."""
 
 from __future__ import annotations
 
 import io
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -21,43 +22,32 @@ from mjxball.files import write_whole
 from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.reading import is_number, parse_json
 
-# 5: with a GRU below the network, arrays GRU_ARRAYS; if it is told where drones are mounted, with card field `context`.
+# 5: with a GRU (arrays GRU_ARRAYS); with `context` in the metadata its inputs include the geometry of the team.
 FORMAT_VERSIONS = (1, 5)
-ENDED = {  # formats that stood on an LQG with numbers of its own
+ENDED = {  # formats of networks on top of an LQG, whose parameters the file holds
     2: "an LQG of a pair",
     3: "an LQG of one of a team",
     4: "LQGs for attitude loops that nobody knows",
 }
-LAST_VERSION = "0.1.0"  # of mjxball that flies them
+LAST_VERSION = "0.1.0"  # the last of mjxball that flies them
 GRU_ARRAYS = ("gru_kernel", "gru_recurrent", "gru_bias")
 MAX_UNITS = 512
-MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
-FOLDER = "policies"  # of those that come with mjxball
-ARCHIVE = "archive"  # in it: earlier ones, which documents name
-READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
+MAX_NUMBER = 1e6  # size of any number in the metadata and of any weight; larger ones would overflow
+FOLDER = "policies"  # shipped policies
+ARCHIVE = "archive"  # in FOLDER: earlier policies that documents name
+READ_OF_CONFIG = ("leader", "attitude", "reward")  # sections of the configuration that evaluation reads
 MAX_CARD = 2**20  # characters
-# Metrics that a card may bound, all of them the better the smaller.
+# Metrics with bounds in the metadata; of each smaller values are better.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 CARD_FIELDS: dict[str, type] = {
-    "format_version": int,
-    "observation": list,
-    "history": int,
+    **dict.fromkeys(("format_version", "history", "training_steps"), int),
+    **dict.fromkeys(("gravity", "control_period"), float),
     "previous_action": bool,
-    "action": list,
-    "action_mode": str,
-    "action_reach": list,
-    "command_limits": list,
-    "leader_kp": list,
-    "leader_kd": list,
-    "gravity": float,
-    "control_period": float,
-    "plant": dict,
-    "preset": str,
-    "config_hash": str,
-    "package_version": str,
-    "training_steps": int,
-    "bounds": dict,
+    **dict.fromkeys(("action_mode", "preset", "config_hash", "package_version"), str),
+    **dict.fromkeys(("observation", "action", "action_reach", "command_limits", "leader_kp", "leader_kd"), list),
+    **dict.fromkeys(("plant", "bounds"), dict),
 }
+LENGTHS = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
 
 
 @dataclass(frozen=True)
@@ -65,16 +55,16 @@ class PolicyFile:
     """Contents of a policy file."""
 
     weights: tuple[np.ndarray, ...]  # float32, (n_in, n_out) each
-    biases: tuple[np.ndarray, ...]  # float32, (n_out,) each; the last layer gives mean and deviation parameters
+    biases: tuple[np.ndarray, ...]  # float32, (n_out,) each; outputs of the last layer are means, then deviations
     observation_mean: np.ndarray  # (n,) float32
-    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
+    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for an input that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
     gru: tuple[np.ndarray, ...] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
-    """What is around the network of a policy file; `filters` is absent from the first files."""
+    """The controller around the network of a policy file with metadata `card`; the first files have no `filters`."""
     filters = tuple(card.get("filters", ()))
     return FollowerLaw(
         history=ObservationHistory(card["previous_action"], filters, float(card["control_period"])),
@@ -90,7 +80,7 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
-    """Write `policy` to `path` atomically: a reader sees the old file or the whole new one."""
+    """Write `policy` to `path` atomically: a reader sees the old file or the complete new one."""
     check(policy, str(path))
     arrays: dict[str, Any] = {
         "observation_mean": policy.observation_mean,
@@ -108,7 +98,7 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
 
 
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:
-    """Read and verify a policy file; raise PolicyFileError with one sentence on anything unsound."""
+    """Read and check a policy file; raise PolicyFileError for anything invalid."""
     name = str(path)
     try:
         arrays = read_arrays(name)
@@ -123,7 +113,7 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
             )
             raise PolicyFileError(f"{name} is not a policy file: it has no {needed}{foreign}")
     card = _read_card(name, arrays.pop("card"))
-    _check_version(card, name)  # before the arrays, which later formats may have others of
+    _check_version(card, name)  # before the arrays, which may differ in later formats
     layers = 0
     while f"weight_{layers}" in arrays:
         layers += 1
@@ -148,10 +138,10 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
 
 
 def load_network(path: str | os.PathLike[str]) -> Network:
-    """The network in `policy.npz` of a run on an environment of one's own.
+    """The network in `policy.npz` of a run on another environment (`--env`).
 
-    It answers observations (..., n) of float32 with actions (..., a) in [-1, 1]. Raises PolicyFileError if the file
-    holds no such network.
+    It maps observations (..., n) of float32 to actions (..., a) in [-1, 1]. Raises PolicyFileError if the file holds no
+    such network.
     """
     arrays = read_arrays(str(path))
     layers = sum(name.startswith("weight_") for name in arrays)
@@ -159,7 +149,7 @@ def load_network(path: str | os.PathLike[str]) -> Network:
         weights = [arrays[f"weight_{number}"] for number in range(layers)]
         biases = [arrays[f"bias_{number}"] for number in range(layers)]
         mean, scale = arrays["observation_mean"], arrays["observation_scale"]
-        half = len(biases[-1]) // 2  # the other one is of the deviation
+        half = len(biases[-1]) // 2  # the other half is the deviation
         found = Network([*weights[:-1], weights[-1][:, :half]], [*biases[:-1], biases[-1][:half]], mean, scale)
         found(np.zeros_like(mean))
     except (KeyError, IndexError, TypeError, ValueError):
@@ -170,7 +160,7 @@ def load_network(path: str | os.PathLike[str]) -> Network:
 def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.ndim != 0 or text.dtype.kind != "U":
         raise PolicyFileError(f"{name}: the card is not one string")
-    if text.dtype.itemsize > 4 * MAX_CARD:  # JSON takes fifty times its own length in memory
+    if text.dtype.itemsize > 4 * MAX_CARD:  # parsed JSON takes fifty times as much memory
         raise PolicyFileError(f"{name}: the card is longer than {MAX_CARD} characters")
     try:
         card = parse_json(str(text))
@@ -182,7 +172,7 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 
 
 def check(policy: PolicyFile, name: str) -> None:
-    """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
+    """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is valid."""
     _check_card(policy.card, name)
     law = law_of(policy.card)
     size = law.input_size
@@ -247,99 +237,95 @@ def _check_version(card: dict[str, Any], name: str) -> None:
 
 def _check_card(card: dict[str, Any], name: str) -> None:
     _check_version(card, name)
+    for fault in _card_faults(card):
+        raise PolicyFileError(f"{name}: {fault}")
+
+
+def _card_faults(card: dict[str, Any]) -> Iterator[str]:
+    """Phrases on what is wrong with the metadata of a policy; after the first one others need not be right."""
     for field, kind in CARD_FIELDS.items():
         value = card.get(field)
-        if isinstance(value, bool) and kind is not bool:
-            value = None
-        if not isinstance(value, (int, float) if kind is float else kind):
-            raise PolicyFileError(f"{name}: card field {field} is missing or not {kind.__name__}")
+        kinds = (int, float) if kind is float else kind
+        if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
+            yield f"card field {field} is missing or not {kind.__name__}"
     if card["observation"] != [list(slot) for slot in OBSERVATION]:
-        raise PolicyFileError(f"{name} was made for another observation than this version's 18 numbers")
+        yield "the policy was made for another observation than this version's 18 numbers"
     if card["action"] != [list(slot) for slot in ACTION]:
-        raise PolicyFileError(f"{name} was made for another action than roll, pitch, vertical acceleration")
+        yield "the policy was made for another action than roll, pitch, vertical acceleration"
     config = card.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
-        raise PolicyFileError(f"{name}: card field config is not a configuration")
-    _check_card_numbers(card, name)
+        yield "card field config is not a configuration"
+    yield from _number_faults(card)
+    if card["format_version"] == 5 and "context" in card:
+        yield from _geometry_faults(card)
+    if card.get("flown") is not None:
+        yield from _flown_faults(card["flown"])
 
 
-def _check_card_numbers(card: dict[str, Any], name: str) -> None:
+def _number_faults(card: dict[str, Any]) -> Iterator[str]:
+    """Of fields that have the right types."""
     if card["action_mode"] not in ("residual", "direct"):
-        raise PolicyFileError(f"{name}: action_mode must be residual or direct, not {card['action_mode']!r}")
+        yield f"action_mode must be residual or direct, not {card['action_mode']!r}"
     if card["history"] != 1:
-        raise PolicyFileError(f"{name}: history must be 1, not {card['history']}; more of it mjxball 0.1.0 flies")
+        yield f"history must be 1, not {card['history']}; more of it mjxball {LAST_VERSION} flies"
     filters = card.get("filters", [])
     if not isinstance(filters, list) or len(filters) > 10 or not all(is_finite(t) and t >= 1e-3 for t in filters):
-        raise PolicyFileError(f"{name}: filters must be up to 10 time constants of at least 1 ms")
-    lengths = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
-    for field, length in lengths.items():
-        numbers = card[field]
-        if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
-            raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
-    _check_geometry(card, name)
-    _check_flown(card.get("flown"), name)
+        yield "filters must be up to 10 time constants of at least 1 ms"
+    for field, length in LENGTHS.items():
+        if len(card[field]) != length or not all(is_finite(value) and value >= 0 for value in card[field]):
+            yield f"card field {field} must be {length} finite numbers"
     units, most = card.get("recurrent_units", 0), MAX_UNITS if card["format_version"] == 5 else 0
     if type(units) is not int or not min(most, 1) <= units <= most:
-        raise PolicyFileError(
-            f"{name}: card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
-        )
+        yield f"card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
     for field in ("control_period", "gravity"):
         if not (is_finite(card[field]) and card[field] >= 1e-6):
-            raise PolicyFileError(f"{name}: card field {field} must be positive")
-    if not all(is_finite(value) for value in card["bounds"].values()):
-        raise PolicyFileError(f"{name}: card field bounds must hold finite numbers")
-    odd = sorted(set(card["bounds"]) - set(BOUNDED))
-    if odd:
-        raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
+            yield f"card field {field} must be positive"
+    if not all(map(is_finite, card["bounds"].values())):
+        yield "card field bounds must hold finite numbers"
+    for odd in sorted(set(card["bounds"]) - set(BOUNDED)):
+        yield f"card field bounds names {odd!r}; known are {', '.join(BOUNDED)}"
 
 
-def _check_geometry(card: dict[str, Any], name: str) -> None:
-    """Raise PolicyFileError unless a policy that is told where drones are mounted names what it can be told."""
-    if card["format_version"] != 5 or "context" not in card:
-        return
+def _geometry_faults(card: dict[str, Any]) -> Iterator[str]:
+    """Of `context`, and of `team`: the geometry of a team as one of its drones sees it."""
     if card["context"] != list(GEOMETRY):
-        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(GEOMETRY)}")
-    if "team" in card:
-        _check_team(card["team"], name)
-
-
-def _check_team(team: Any, name: str) -> None:
-    """Raise PolicyFileError unless `team` says in which team, and as which of its drones, a policy flies."""
+        yield f"the policy needs another context than this version's {', '.join(GEOMETRY)}"
+    if "team" not in card:
+        return
+    team = card["team"]
     if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
-        raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
+        yield "card field team must hold drone, mount_angle and context"
     if not (is_finite(team["drone"]) and is_finite(team["mount_angle"])):
-        raise PolicyFileError(f"{name}: card fields team.drone and team.mount_angle must be finite numbers")
+        yield "card fields team.drone and team.mount_angle must be finite numbers"
     context = team["context"]
     if not (isinstance(context, list) and len(context) == len(GEOMETRY) and all(map(is_finite, context))):
-        raise PolicyFileError(f"{name}: card field team.context must be {len(GEOMETRY)} finite numbers")
+        yield f"card field team.context must be {len(GEOMETRY)} finite numbers"
     share, _, _, room = context
     if share <= 1 or room <= 0:
-        raise PolicyFileError(f"{name}: card field team.context: command_share must be above 1 and rotor_room positive")
+        yield "card field team.context: command_share must be above 1 and rotor_room positive"
 
 
-def is_finite(value: Any) -> bool:
-    """Whether `value` of a card is one number within bounds, no truth value."""
-    return is_number(value, MAX_NUMBER)
-
-
-def _check_flown(flown: Any, name: str) -> None:
-    """`flown`, if a card has it: the numbers of drones and the seconds up to which flights were found good."""
-    if flown is None:
-        return
+def _flown_faults(flown: Any) -> Iterator[str]:
+    """Of `flown`: numbers of drones, and the duration [s] up to which flights were good."""
     fields: dict[str, Any] = flown if isinstance(flown, dict) else {}
     drones, seconds = fields.get("drones"), fields.get("seconds", 0.0)
     counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
     if not (counts and is_finite(seconds) and seconds > 0):
-        raise PolicyFileError(f"{name}: card field flown must hold drones, numbers above 1, and positive seconds")
+        yield "card field flown must hold drones, numbers above 1, and positive seconds"
+
+
+def is_finite(value: Any) -> bool:
+    """Whether `value` is a number (no bool) of at most `MAX_NUMBER` in size."""
+    return is_number(value, MAX_NUMBER)
 
 
 def shipped_policies() -> list[Path]:
-    """The policy files that come with mjxball, by name, without the archived ones; empty if there are none."""
+    """Paths of the shipped policies by name, without archived ones; empty if none are installed."""
     return sorted(_folder().glob("*.npz"))
 
 
 def shipped_policy(name: str) -> Path:
-    """The shipped file called `name`, such as `balance`, archived ones too; raise InputError if there is none."""
+    """The path of the shipped or archived policy `name`, such as `balance`; InputError if there is none."""
     known = _shipped()
     if name not in known:
         raise InputError(f"no shipped policy is called {name!r}; there are {', '.join(known) or 'none'}")
@@ -347,7 +333,7 @@ def shipped_policy(name: str) -> Path:
 
 
 def policy_path(text: str | os.PathLike[str]) -> Path:
-    """The path that `text` names: what exists there, else the shipped policy of that name, else `text` itself."""
+    """`text` as a path if that exists, else the path of the shipped policy of that name, else `text` as a path."""
     path = Path(text)
     return path if os.path.lexists(path) else _shipped().get(str(text), path)
 
@@ -357,6 +343,6 @@ def _shipped() -> dict[str, Path]:
 
 
 def _folder() -> Path:
-    """A wheel carries them inside the package; a source tree and an editable install have them beside it."""
+    """The folder of shipped policies: inside the package in a wheel, beside it in a source tree."""
     packaged = Path(str(resources.files("mjxball"))) / FOLDER
     return packaged if packaged.is_dir() else Path(__file__).parents[2] / FOLDER

@@ -1,13 +1,14 @@
 """A policy as an ONNX model, with its memory as an input and an output.
 
-The laws of `control/` and `policy/` run once on arrays that only write down what is done, so the graph is what training
-and flight compute, not a second version of it.
+The controller in `control/` and `policy/` runs once on arrays that record operations instead of computing. The graph is
+therefore what training and flight compute, not a second implementation of it.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,21 +26,21 @@ BATCH = "flights"
 
 
 class Graph:
-    """Nodes and constants of a graph that is being written."""
+    """Nodes and constants of the graph that is being written."""
 
     def __init__(self) -> None:
         self.nodes: list[NodeProto] = []
         self.constants: list[TensorProto] = []
 
     def add(self, operation: str, *inputs: Any, **attributes: Any) -> str:
-        """Append a node and return its output's name."""
+        """Append a node and return the name of its output."""
         name = f"{operation.lower()}_{len(self.nodes)}"
         names = [self.name_of(value) for value in inputs]
         self.nodes.append(helper.make_node(operation, names, [name], name=name, **attributes))
         return name
 
     def name_of(self, value: Any) -> str:
-        """The name of a traced array, or of a constant, which is added."""
+        """The name of `value`: a traced array, or a constant, which is added to the graph."""
         if isinstance(value, TracedArray):
             return value.name
         array = np.asarray(value)
@@ -50,7 +51,7 @@ class Graph:
 
 
 class TracedArray:
-    """An array (N, *`shape`) of the graph. Arithmetic on it appends nodes."""
+    """An array (N, *`sizes`) of the graph. Arithmetic and indexing behind N append nodes."""
 
     __array_ufunc__ = None  # NumPy constants on the left defer to the reflected operators
     dtype = np.dtype(np.float32)
@@ -58,20 +59,20 @@ class TracedArray:
     def __init__(self, graph: Graph, name: str, *sizes: int):
         self.graph, self.name, self.sizes = graph, name, sizes
 
-    def __array_namespace__(self, api_version: str | None = None) -> type[Namespace]:
-        return Namespace
+    def __array_namespace__(self, api_version: str | None = None) -> SimpleNamespace:
+        return NAMESPACE
 
     @property
-    def shape(self) -> tuple[Any, ...]:
-        """Its sizes behind itself, which stands for N."""
-        return (self, *self.sizes)
+    def shape(self) -> tuple[int | None, ...]:
+        """None, for the N that is known when the model runs, and the sizes behind it."""
+        return (None, *self.sizes)
 
     def unary(self, operation: str) -> TracedArray:
         """`operation` of every element."""
         return TracedArray(self.graph, self.graph.add(operation, self), *self.sizes)
 
     def binary(self, operation: str, left: Any, right: Any) -> TracedArray:
-        """`left` `operation` `right`, one of which is this array."""
+        """`operation` of `left` and `right`, one of which is this array; they broadcast."""
         sizes = [value.sizes if isinstance(value, TracedArray) else np.shape(value) for value in (left, right)]
         return TracedArray(self.graph, self.graph.add(operation, left, right), *np.broadcast_shapes(*sizes))
 
@@ -87,7 +88,7 @@ class TracedArray:
         return found
 
     def _along(self, axis: int, place: Any) -> tuple[TracedArray, int]:
-        """One index of `axis`, which counts N, and how many axes further the next index belongs."""
+        """(the array indexed by `place` on `axis`, where axis 0 is N; how many axes further the next index applies)."""
         before, after = self.sizes[: axis - 1], self.sizes[axis:]
         if place is None:
             name = self.graph.add("Unsqueeze", self, np.array([axis], np.int64))
@@ -108,79 +109,55 @@ class TracedArray:
         return TracedArray(self.graph, self.graph.add("MatMul", self, weight), *self.sizes[:-1], weight.shape[-1])
 
 
-def _add_operators() -> None:
-    for label, operation in (("add", "Add"), ("sub", "Sub"), ("mul", "Mul"), ("truediv", "Div")):
-        setattr(TracedArray, f"__{label}__", lambda a, b, o=operation: a.binary(o, a, b))
-        setattr(TracedArray, f"__r{label}__", lambda a, b, o=operation: a.binary(o, b, a))
+for label, operation in (("add", "Add"), ("sub", "Sub"), ("mul", "Mul"), ("truediv", "Div")):
+    setattr(TracedArray, f"__{label}__", lambda a, b, o=operation: a.binary(o, a, b))
+    setattr(TracedArray, f"__r{label}__", lambda a, b, o=operation: a.binary(o, b, a))
 
 
-_add_operators()
+def _concat(values: Sequence[TracedArray], axis: int) -> TracedArray:
+    """Join along the last axis; empty arrays are left out."""
+    parts = [value for value in values if value.sizes[-1]] or list(values[:1])
+    return parts[0] if len(parts) == 1 else _joined(parts, -1)
 
 
-class Namespace:
-    """The part of the array namespace that a policy's laws use."""
+def _stack(values: Sequence[TracedArray], axis: int) -> TracedArray:
+    """Join along a new `axis`, counted from the end."""
+    places = (slice(None),) * (-1 - axis)
+    return _joined([value[(..., None, *places)] for value in values], axis)
 
-    @staticmethod
-    def tanh(value: TracedArray) -> TracedArray:
-        """Elementwise."""
-        return value.unary("Tanh")
 
-    @staticmethod
-    def asarray(values: Any, dtype: Any = None) -> Any:
-        """Constants stay NumPy arrays."""
-        return values if isinstance(values, TracedArray) else np.asarray(values, np.float32)
+def _joined(parts: Sequence[TracedArray], axis: int) -> TracedArray:
+    sizes = list(parts[0].sizes)
+    sizes[axis] = sum(part.sizes[axis] for part in parts)
+    return TracedArray(parts[0].graph, parts[0].graph.add("Concat", *parts, axis=axis), *sizes)
 
-    @staticmethod
-    def zeros_like(value: TracedArray) -> TracedArray:
-        """Zeros (N, ...)."""
-        return value.binary("Sub", value, value)
 
-    @staticmethod
-    def broadcast_to(value: np.ndarray, shape: tuple[Any, ...]) -> TracedArray:
-        """A constant (k,) for each of N flights, (N, k)."""
-        flights: TracedArray = shape[0]
-        one_each = flights[(..., *(0,) * len(flights.sizes))]
-        return Namespace.zeros_like(one_each)[..., None] + value
-
-    @staticmethod
-    def maximum(value: TracedArray, other: Any) -> TracedArray:
-        """Elementwise."""
-        return value.binary("Max", value, other)
-
-    @staticmethod
-    def clip(value: TracedArray, low: Any, high: Any) -> TracedArray:
-        """Elementwise."""
-        return value.binary("Min", value.binary("Max", value, low), high)
-
-    @staticmethod
-    def concat(values: Sequence[TracedArray], axis: int) -> TracedArray:
-        """Join along the last axis; empty parts are left out."""
-        parts = [value for value in values if value.sizes[-1]] or list(values[:1])
-        return parts[0] if len(parts) == 1 else Namespace._joined(parts, -1)
-
-    @staticmethod
-    def stack(values: Sequence[TracedArray], axis: int) -> TracedArray:
-        """Join along a new `axis`, counted from the end."""
-        places = (slice(None),) * (-1 - axis)
-        return Namespace._joined([value[(..., None, *places)] for value in values], axis)
-
-    @staticmethod
-    def _joined(parts: Sequence[TracedArray], axis: int) -> TracedArray:
-        sizes = list(parts[0].sizes)
-        sizes[axis] = sum(part.sizes[axis] for part in parts)
-        return TracedArray(parts[0].graph, parts[0].graph.add("Concat", *parts, axis=axis), *sizes)
+NAMESPACE = SimpleNamespace(  # the part of the array API that controllers use
+    __name__="traced",
+    asarray=lambda values, dtype=None: values if isinstance(values, TracedArray) else np.asarray(values, np.float32),
+    zeros_like=lambda value: value.binary("Sub", value, value),
+    tanh=lambda value: value.unary("Tanh"),
+    maximum=lambda value, other: value.binary("Max", value, other),
+    clip=lambda value, low, high: value.binary("Min", value.binary("Max", value, low), high),
+    concat=_concat,
+    stack=_stack,
+)
 
 
 def onnx_model(contents: PolicyFile, name: str) -> Any:
     """The ONNX model of a policy.
 
-    Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
-    the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
-    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory `next_memory` (N, m); `valid` (N, 1) bool.
-    A row is not valid, and its action and command are zeros, if its observation is none (not finite, or an absolute sum
-    of 1e6 or more): `next_memory` is then `memory`, or at a start one that saw zeros; or if its memory or the answer is
-    not finite: `next_memory` is then that of a start. Other rows are as without it. A policy that is told its team is
-    that of the one follower that `team` in its card names, and sees and commands in its mount frame.
+    Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m), and `start` (N, 1) bool, true at the
+    first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1]; `command` (N, 3): roll,
+    pitch [rad], vertical acceleration [m/s2]; with a memory `next_memory` (N, m); `valid` (N, 1) bool.
+
+    In a row that is not valid action and command are zeros, and other rows are not affected. There are two causes. If
+    the observation is not finite, or its absolute sum is 1e6 or more, `next_memory` is `memory`, or at a start the
+    memory after an observation of zeros. If the memory or the answer is not finite, `next_memory` is the memory of a
+    start.
+
+    A policy that needs the geometry of its team is exported for one follower, named by `team` in its metadata. That
+    follower observes and commands in its mount frame.
     """
     graph, around = Graph(), law_of(contents.card)
     law = NetworkLaw(Policy(contents, "traced", np.float32))
@@ -213,9 +190,9 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
 
 def _is_below(limit: float, *parts: TracedArray) -> TracedArray:
-    """Whether a row's absolute sum is below `limit` (N, 1); of NaN and infinity it is not."""
-    size = Namespace.concat(parts, -1).unary("Abs")
-    total = size @ np.ones((size.sizes[-1], 1))  # runtimes have no ReduceSum of no flights
+    """Whether the absolute sum of a row is below `limit` (N, 1); false for rows with NaN or infinity."""
+    size = _concat(parts, -1).unary("Abs")
+    total = size @ np.ones((size.sizes[-1], 1))  # ReduceSum fails in runtimes if N is 0
     return total.binary("Less", total, np.array([limit]))
 
 
