@@ -285,9 +285,9 @@ static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
         app->climb = velocity[2];
         share = 1 + clip(-0.4f * (app->climb + SINK_SPEED), -0.3f, 0.1f);
     } else {
-        float wanted = clip(3 * (-BLIND_SPEED - app->climb), -3, -0.15f);
-        app->climb += wanted * period;
-        share = 1 + wanted / (float)MJXBALL_GRAVITY;
+        float acceleration = clip(3 * (-BLIND_SPEED - app->climb), -3, -0.15f);
+        app->climb += acceleration * period;
+        share = 1 + acceleration / (float)MJXBALL_GRAVITY;
     }
     app->height += app->climb * period;
     send_level(out, tilt[0], tilt[1], app->trim * share);

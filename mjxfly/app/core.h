@@ -135,7 +135,7 @@ typedef struct {
     float integral[7];
     float trim;       /* hover thrust [thrust units] */
     float climb, height; /* model of a descent without estimates */
-    float share, apart, resting; /* of the take-off: mean lift, half difference [hover], the stick's angle at rest [rad] */
+    float share, apart, resting; /* of the take-off: mean lift, half difference [hover], angle at rest [rad] */
     float needed; /* hover force of this drone with a level stick over the nominal one, found by the take-off */
     uint32_t low_since; /* since then it has not sunk more than RESTING below `low` [m] */
     float low;

@@ -207,7 +207,7 @@ README = """\
 # {name} on board
 
 Made by `python -m mjxfly.app POLICY DIR` (configuration {hash}, {weights} weights, {flash} bytes of
-constants, a law every {period} ms, number {ident}).
+constants, control period {period} ms, CRC of the weights {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`
 with `checks.h`, `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's

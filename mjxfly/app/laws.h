@@ -172,10 +172,10 @@ static void leader_error(const pair_state *pair, const float *goal, float *error
 }
 
 static void pid(const float *error, const float *rate, const float *integral, float *command) {
-    float wanted[3];
+    float acceleration[3];
     for (int i = 0; i < 3; i++)
-        wanted[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
-    command_of(wanted, command);
+        acceleration[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
+    command_of(acceleration, command);
 }
 
 /* Bound of the leader's integral of the stick's angle [rad s]. */

@@ -63,7 +63,7 @@ CAUSES = (
     "tilted beyond the limit",
     CANNOT_FLY,
     "thrust at its bound for too long",
-    "the law comes late",
+    "the controller is late",
     "the phase lasted too long",
     "on the ground",
     "weights refused: wrong rate, plant, layers, size or CRC",

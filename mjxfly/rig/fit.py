@@ -79,10 +79,7 @@ class MotorModel(NamedTuple):
 
 
 def motor_model(config: Config, log: Log) -> MotorModel:
-    """Return the motor model of the firmware that flew.
-
-    Firmware with battery compensation reaches full power at the battery's voltage only: at `log.volts` or a usual one.
-    """
+    """Return the motor model of the firmware that flew; battery compensation uses `log.volts` or a usual voltage."""
     curve, motor = config.autopilot.motor_curve, motor_of(config)
     if curve[0] > 0:
         return MotorModel(None, lambda command: crazyflie.motor_force(curve, command))
@@ -169,10 +166,7 @@ def pair_mass(config: Config) -> float:
 
 
 def _initial_loops(log: Log, history: CascadeHistory, begins: Array, roll: Array, rate: Array) -> tuple[Array, Array]:
-    """Cascade states (n, 2, 13) and motor forces (n, 2, 4) [N] at the windows' first ticks.
-
-    The cascade's previous measurement is the window's initial state, `roll` and `rate` (n,).
-    """
+    """Cascade states (n, 2, 13), last measurement replaced by `roll`, `rate` (n,); motor forces (n, 2, 4) [N]."""
     euler, rates = log.euler[begins].copy(), log.rates[begins].copy()
     euler[:, 0], rates[:, 0] = roll, rate
     measured = np.concatenate([crazyflie.to_firmware(euler), crazyflie.to_firmware(rates)], axis=-1)
@@ -305,10 +299,8 @@ def _linearize(
     all_common[1 : 1 + COMMON] += np.diag(DIFFERENCE)
     all_starts = np.broadcast_to(starts, (width, count, PER_WINDOW)).copy()
     all_starts[1 + COMMON :] += np.diag(START_DIFFERENCE)[:, None, :]
-    parameters, start = (
-        _parameters(np.repeat(all_common, count, axis=0)),
-        WindowStart(*all_starts.reshape(-1, PER_WINDOW).T),
-    )
+    parameters = _parameters(np.repeat(all_common, count, axis=0))
+    start = WindowStart(*all_starts.reshape(-1, PER_WINDOW).T)
     simulated = simulate_windows(config, log, history, np.tile(begins, width), ticks, parameters, start)
     simulated = simulated.reshape(len(simulated), width, count, 3).transpose(1, 2, 0, 3)  # (width, n, rows, 3)
     when = begins[:, None] + np.arange(0, ticks, log.every)

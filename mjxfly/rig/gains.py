@@ -64,10 +64,7 @@ def parameter_file(autopilot: config.Autopilot) -> str:
 
 
 def report(designs: Sequence[Design], lag: float) -> str:
-    """Return a table: per axis the designed and the firmware's default gains, with nominal and worst-case margins.
-
-    `lag` is the motors' time constant [s].
-    """
+    """Return a table: per axis the designed and the delivered gains, with nominal and worst margins; `lag` in [s]."""
     head = ("axis", "inertia", "gains", "attitude kp ki kd", "rate kp ki kd", "phase", "gain", "delay", "worst")
     rows: list[tuple[str, ...]] = [head]
     for one in designs:

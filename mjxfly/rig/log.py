@@ -147,7 +147,7 @@ def _of_flight(flown: FlightLog) -> Log:
     own = [[one for one in flown.records if one["kind"] == "state" and one["drone"] == name] for name in NAMES]
     guided = np.array([one["state"] == GUIDED for one in ticks])
     if not guided.any():
-        raise InputError(f"flight log {flown.path} holds no guided flight: its laws were never in command")
+        raise InputError(f"flight log {flown.path} holds no guided flight: its controllers were never in command")
     try:
         log = make_log(
             np.array([one["t"] for one in ticks]),

@@ -36,7 +36,7 @@ def main() -> int:
     """Command line of the twin; returns the exit code."""
     parser = make_parser("python -m mjxfly.twin", __doc__ or "")
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
-    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
+    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its metadata define the rig")
     for name in ("loss", "delay", "jitter"):
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
     parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")

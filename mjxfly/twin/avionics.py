@@ -172,10 +172,10 @@ class Onboard:
         """
         held = self._modes.held
         before = self.imu.filtered
-        seen = self.imu.sample(raw, self.pwm.max(axis=1, keepdims=True) > 0)
+        samples = self.imu.sample(raw, self.pwm.max(axis=1, keepdims=True) > 0)
         if held[0] or held[1]:
-            seen = self.imu.filtered = np.where(np.array(held)[:, None], before, seen)
-        self._summed += seen
+            samples = self.imu.filtered = np.where(np.array(held)[:, None], before, samples)
+        self._summed += samples
         for drone in range(2):
             if held[drone]:
                 continue
@@ -189,13 +189,13 @@ class Onboard:
                 if system.due(step):
                     positions, quaternion, _ = where()
                     if isinstance(system, Deck):
-                        system.correct(self.filters[drone], positions[drone], quaternion, seen[drone, 3:], step)
+                        system.correct(self.filters[drone], positions[drone], quaternion, samples[drone, 3:], step)
                         self._update_euler(drone)
                     else:
                         self.receive_pose(drone, *system.measure(positions[drone], quaternion))
             elif step % COMPLEMENTARY_PERIOD == 0:
                 height = float(where()[0][drone, 2])
-                self.plain[drone].update(seen[drone, :3], seen[drone, 3:], height, COMPLEMENTARY_PERIOD * 1e-3)
+                self.plain[drone].update(samples[drone, :3], samples[drone, 3:], height, COMPLEMENTARY_PERIOD * 1e-3)
                 self._update_euler(drone)
 
     def _filter(self, step: int, drone: int) -> None:

@@ -230,9 +230,9 @@ class CoupledPair:
         assert self._prescribed is not None
         data.qfrc_applied[self._slide] = 0.0
         mujoco.mj_fwdActuation(model, data)
-        wanted = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
+        acceleration = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
         slides = slice(self._slide, self._slide + 1)
-        return float(slide_force(model, data, slides, wanted, data.qfrc_actuator - data.qfrc_bias)[0])
+        return float(slide_force(model, data, slides, acceleration, data.qfrc_actuator - data.qfrc_bias)[0])
 
     def _place_ball(self) -> None:
         """Set a prescribed ball to its trajectory, against integration drift; a rolling one to its start in step 0."""

@@ -86,10 +86,7 @@ class Pair(Protocol):
         ...
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
-        """Apply a written parameter, such as "pid_attitude.roll_kp", of `drone` (0 leader, 1 follower).
-
-        Names without a meaning for the physics are ignored.
-        """
+        """Apply a written parameter of `drone` (0 leader, 1 follower), "pid_attitude.roll_kp" say; ignore others."""
 
     def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
         """Handle a pose that the laptop sent: `position` (3,) [m] and, if known, `quaternion` (4,) (w, x, y, z)."""

@@ -87,8 +87,8 @@ class StandIn:
         setpoints = np.where(held, np.array([[0.0, 0.0, 0.0, thrust] for thrust in self._commands]), setpoints)
         setpoints = setpoints * np.array(modes.run)[:, None]
         self._commands = setpoints[:, 3].copy()
-        wanted = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
-        self._thrust += (wanted - self._thrust) * -np.expm1(-dt / plant.motor_lag)
+        target = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
+        self._thrust += (target - self._thrust) * -np.expm1(-dt / plant.motor_lag)
         self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
         matrix = rotations.matrix_from_quaternion(self._quaternion)
         force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])

@@ -38,7 +38,7 @@ from mjxfly.twin.protocol import header
 
 STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
 GROUNDED = 3e-3  # [m] largest height above rest that counts as touched down
-BLOCK, HEALTH_BLOCK, APP_BLOCK, SENSED_BLOCK = 1, 2, 3, 4  # numbers of the log blocks; BLOCK: state
+BLOCK, HEALTH_BLOCK, APP_BLOCK, SENSED_BLOCK = 1, 2, 3, 4  # ids of the log blocks; BLOCK: state
 HEALTH = (*packets.VARIANCES, *packets.MOTORS[0], packets.ACTING_THRUST)
 _HEALTH, _SENSED = struct.Struct("<3f4Hf"), struct.Struct("<3e3f4e")
 

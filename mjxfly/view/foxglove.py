@@ -91,49 +91,49 @@ class Foxglove:
             channel = {"id": number, "topic": topic, "encoding": message_encoding, **self._schemas[schema_id - 1]}
             self._channels.append(channel)
             for client in self._clients:
-                client.tell(json.dumps({"op": "advertise", "channels": [channel]}))
+                client.enqueue(json.dumps({"op": "advertise", "channels": [channel]}))
         return number
 
     def add_message(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
         """Queue a message of the topic `channel_id` for its subscribers; times in [ns]."""
         with self._lock:
             for client in self._clients:
-                for subscription, channel in client.wanted.items():
+                for subscription, channel in client.subscriptions.items():
                     if channel == channel_id:
-                        client.tell(DATA.pack(1, subscription, log_time) + data)
+                        client.enqueue(DATA.pack(1, subscription, log_time) + data)
 
     def _serve_client(self, connection: Any) -> None:
         """Serve one connection in its thread, until the client leaves or violates the protocol."""
         client = _Client(connection)
         with self._lock:
-            client.tell(json.dumps({"op": "serverInfo", "name": "mjxball", "capabilities": [], "metadata": {}}))
-            client.tell(json.dumps({"op": "advertise", "channels": self._channels}))
+            client.enqueue(json.dumps({"op": "serverInfo", "name": "mjxball", "capabilities": [], "metadata": {}}))
+            client.enqueue(json.dumps({"op": "advertise", "channels": self._channels}))
             self._clients.append(client)
         sending = threading.Thread(target=client.send, daemon=True)
         sending.start()
         try:
             for text in connection:
-                wanted = _subscriptions(text, client.wanted)
+                subscriptions = _subscriptions(text, client.subscriptions)
                 with self._lock:
-                    client.wanted = wanted
+                    client.subscriptions = subscriptions
         except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
             connection.close(1002)
         finally:
             with self._lock:
                 self._clients.remove(client)
-            client.tell(None)
+            client.enqueue(None)
 
 
 class _Client:
     """Message queue and subscriptions of one client."""
 
     def __init__(self, connection: Any):
-        self.wanted: dict[int, int] = {}  # subscription number -> channel number
+        self.subscriptions: dict[int, int] = {}  # subscription number -> channel number
         self._connection = connection
         self._waiting: collections.deque[str | bytes | None] = collections.deque()
         self._news = threading.Condition()
 
-    def tell(self, message: str | bytes | None) -> None:
+    def enqueue(self, message: str | bytes | None) -> None:
         """Queue `message`; None ends the queue. A full queue drops its oldest binary message, never a text message."""
         with self._news:
             data = (place for place, one in enumerate(self._waiting) if isinstance(one, bytes))
@@ -163,10 +163,7 @@ class _Client:
 
 
 def _check(connection: Any, request: Any) -> Any:
-    """Return None for an allowed `request`, else a response that refuses it.
-
-    Allowed are programs of this machine, pages that it serves, and Foxglove's pages.
-    """
+    """Return None for a `request` of a local program, a page of this machine or Foxglove's, else a refusal."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     # DNS rebinding: a foreign name that resolves to the loopback appears as the host.
     if len(hosts) != 1 or urlsplit(f"//{hosts[0]}").hostname not in LOOPBACK or not all(map(_is_allowed, origins)):
@@ -181,17 +178,14 @@ def _is_allowed(origin: str) -> bool:
     return origin == FOXGLOVE or url.scheme == "file" or local
 
 
-def _subscriptions(text: str | bytes, wanted: dict[int, int]) -> dict[int, int]:
-    """Return the subscriptions `wanted` after the client's message `text`; other messages change nothing.
-
-    Raises ValueError for malformed messages.
-    """
+def _subscriptions(text: str | bytes, current: dict[int, int]) -> dict[int, int]:
+    """Return the subscriptions `current` as changed by the client's message `text`. Raises ValueError."""
     request = parse_json(text) if isinstance(text, str) else {}
     if request.get("op") == "subscribe":
         added = {one["id"]: one["channelId"] for one in request["subscriptions"]}
         if not all(type(number) is int and 0 <= number < 2**32 for number in added):
             raise ValueError("a number of 32 bits")
-        return wanted | added
+        return current | added
     if request.get("op") == "unsubscribe":
-        return {number: channel for number, channel in wanted.items() if number not in request["subscriptionIds"]}
-    return wanted
+        return {number: channel for number, channel in current.items() if number not in request["subscriptionIds"]}
+    return current
