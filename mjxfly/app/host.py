@@ -58,7 +58,7 @@ class State(ctypes.Structure):
     )
 
 
-class Wanted(ctypes.Structure):
+class AppSetpoint(ctypes.Structure):
     """`mjxball_setpoint`."""
 
     _fields_ = (
@@ -137,9 +137,9 @@ class App:
         scalars = {"curve": self._set.curve, "battery": self._set.battery}
         return {**vectors, **scalars, "ident": self.ident, "role": self.role, "period": self.period}
 
-    def tick(self, state: State, now: int) -> Wanted:
+    def tick(self, state: State, now: int) -> AppSetpoint:
         """Run one period; return the setpoint for the commander."""
-        wanted = Wanted()
+        wanted = AppSetpoint()
         self._c.tick(
             self._core, ctypes.byref(self._set), ctypes.byref(state), ctypes.c_uint32(now), ctypes.byref(wanted)
         )
