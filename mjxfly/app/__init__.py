@@ -1,1 +1,1 @@
-"""The pair without a laptop in the loop: apps for the Crazyflie's firmware, and the same C for the twin."""
+"""Control of a pair on board: C apps for the Crazyflie's firmware, and the same C compiled for the twin."""

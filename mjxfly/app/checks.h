@@ -1,4 +1,4 @@
-/* What is believed of what comes in, at every period, and what may leave. Part of core.c. */
+/* Checks of all inputs and outputs in every period. Part of core.c. */
 #ifndef MJXBALL_CHECKS_H
 #define MJXBALL_CHECKS_H
 
@@ -9,14 +9,14 @@
 
 #define CEILING 60000.0f        /* [thrust units] */
 #define FLOOR 10001.0f
-#define SENT_TILT 0.2617994f    /* [rad] 15 degrees, of every setpoint */
-#define DEGREES 57.295780f      /* in a radian */
+#define SENT_TILT 0.2617994f    /* [rad] 15 degrees, largest roll and pitch of a setpoint */
+#define DEGREES 57.295780f      /* per radian */
 #define STATE_AGE 100u          /* [ms] */
 #define VARIANCE 5e-4f          /* [m2] */
-#define MOST_PLACE 1000.0f      /* [m] of a state */
+#define MOST_PLACE 1000.0f      /* [m] coordinate of a state */
 #define MOST_SPEED 50.0f        /* [m/s] of a state and of a heartbeat */
-#define APART 0.15f             /* share of hover that the drones lift apart at most */
-#define MOST_RATE 50.0f         /* [rad/s]; the gyroscope ends at 35 */
+#define APART 0.15f             /* largest half difference of the drones' lifts [hover] */
+#define MOST_RATE 50.0f         /* [rad/s]; the gyroscope's range is 35 */
 #define MOST_VOLTAGE 10.0f      /* [V] */
 
 /* Parameters. */
@@ -42,7 +42,7 @@ static bool mount_is_set(const mjxball_parameters *set) {
     return within(set->mount, 3, 1) && size > 1e-6f && size < 1;
 }
 
-/* What is wrong with parameters. */
+/* The first fault of the parameters, MJXBALL_GOOD for none. */
 static uint8_t fault_of(const mjxball_parameters *set) {
     if (!mount_is_set(set)) return MJXBALL_NO_MOUNT;
     if (!goal_is_good(set)) return MJXBALL_BAD_GOAL;
@@ -50,8 +50,8 @@ static uint8_t fault_of(const mjxball_parameters *set) {
     return within(&set->battery, 1, MOST_VOLTAGE) && set->battery > 0 ? MJXBALL_GOOD : MJXBALL_BAD_BATTERY;
 }
 
-/* Parameters can change at any moment. While some are unsound the last sound ones stay in use. Mount and curve are those
- * that the motors start and the ramp begins with: spinning motors show the laptop the curve. Returns what is wrong. */
+/* Takes over parameters, which can change at any time, if all are valid. The mount is fixed once the motors turn, the
+ * curve once the ramp begins, since the laptop finds the curve by spinning motors. Returns the fault. */
 static uint8_t adopt(mjxball_app *app, const mjxball_parameters *asked) {
     const bool running = app->phase != MJXBALL_IDLE;
     uint8_t fault = fault_of(asked);
@@ -73,7 +73,7 @@ static bool state_is_good(const mjxball_state *state, uint32_t now) {
         && now - state->time <= STATE_AGE;
 }
 
-/* A variance of 0 is that of an estimator which does not run. */
+/* An estimator that does not run has a variance of 0. */
 static bool estimate_is_good(const mjxball_state *state) {
     for (int i = mjxball_rig.stand ? 2 : 0; i < 3; i++)
         if (!within(state->variance + i, 1, VARIANCE) || state->variance[i] <= 0) return false;
@@ -84,7 +84,7 @@ static bool is_charged(const mjxball_app *app, const mjxball_state *state) {
     return within(&state->voltage, 1, MOST_VOLTAGE) && state->voltage >= app->set.battery;
 }
 
-/* What the law commands, and what is sent. */
+/* Command of the controller, and setpoint. */
 
 static bool command_is_good(const mjxball_app *app) {
     return within(app->command, 3, 1000);

@@ -1,4 +1,4 @@
-/* See core.h. No allocation, no globals but constants, no library; products and sums must not be contracted. */
+/* See core.h. No allocation, no global variables, no library; compile with -ffp-contract=off. */
 #include "core.h"
 
 #include "checks.h"
@@ -21,14 +21,14 @@
 #define BATTERY_TIME 5000u
 #define NEAR_GROUND 0.04f     /* [m] */
 #define STILL 0.12f           /* [m/s] */
-#define REST 150u             /* [ms] in which what stands does not sink by more than RESTING */
+#define REST 150u             /* [ms] it has landed if it does not sink by more than RESTING for this time */
 #define RESTING 0.005f        /* [m] */
 #define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
 /* The take-off, as in takeoff.py of mjxfly. */
-#define BEGIN 0.85f           /* of the ramp, from which on thrust follows the climb */
-#define LIFT_TIME 4000u       /* [ms] beyond the ramp */
+#define BEGIN 0.85f           /* fraction of the ramp after which the climb rate is controlled */
+#define LIFT_TIME 4000u       /* [ms] after the ramp */
 #define LIFTED 0.05f          /* [m] */
-#define MOST_LIFT 1.25f       /* share of hover */
+#define MOST_LIFT 1.25f       /* [hover] */
 #define CLIMB 0.1f            /* [m/s] */
 #define CLIMB_GAIN 0.4f
 #define CLIMB_INTEGRAL 1.5f
@@ -73,7 +73,7 @@ static void send_level(mjxball_setpoint *out, float roll, float pitch, float thr
     out->thrust = clip(thrust, FLOOR, CEILING);
 }
 
-/* True if the thrust was cut. */
+/* True if the thrust was clipped. */
 static bool send_command(const mjxball_app *app, const mjxball_map *map, mjxball_setpoint *out) {
     float roll = clip(app->command[0], -SENT_TILT, SENT_TILT), pitch = clip(app->command[1], -SENT_TILT, SENT_TILT);
     float up = app->command[2], thrust = app->needed * (map->hover + map->per_acceleration * up);
@@ -95,7 +95,7 @@ static bool laptop_is_heard(const mjxball_app *app) {
     return app->laptop_time && app->now - app->laptop_time <= LAPTOP_AGE;
 }
 
-/* Why it must not start. */
+/* Why it must not start, MJXBALL_GOOD if it may. */
 static uint8_t refusal_of(const mjxball_app *app, uint8_t fault, const mjxball_state *state) {
     if (fault) return fault;
     if (!state_is_good(state, app->now)) return MJXBALL_BAD_STATE;
@@ -107,7 +107,7 @@ static uint8_t refusal_of(const mjxball_app *app, uint8_t fault, const mjxball_s
     return app->peer.phase > MJXBALL_SPIN ? MJXBALL_PEER : MJXBALL_GOOD;
 }
 
-/* What the drones are to lift apart, as both found it: attitudes that disagree wind each one up by itself. */
+/* Half difference of the lifts that both take-offs found: differing attitude estimates let a single integral grow. */
 static float found_apart(const mjxball_app *app) {
     float own = app->apart, other = app->peer.apart;
     if (own * other <= 0) return 0;
@@ -142,15 +142,15 @@ static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_
     }
 }
 
-/* The furthest phase that anything asks for. */
+/* The highest requested phase, and why. */
 typedef struct {
     uint8_t phase, cause;
-} wish;
+} request;
 
-static void ask(wish *one, uint8_t phase, uint8_t cause) {
-    if (phase > one->phase) {
-        one->phase = phase;
-        one->cause = cause;
+static void ask(request *highest, uint8_t phase, uint8_t cause) {
+    if (phase > highest->phase) {
+        highest->phase = phase;
+        highest->cause = cause;
     }
 }
 
@@ -158,12 +158,12 @@ static float height_of(const mjxball_app *app) {
     return app->position[2] - app->origin[2];
 }
 
-/* From where on the legs carry nothing, so that the law may take over. */
+/* Height from which on the legs carry no load and the controller may take over. */
 static float lifted_height(const mjxball_app *app) {
     return clip(app->set.goal[2] / 2, 0.001f, LIFTED);
 }
 
-static void watch_rest(mjxball_app *app, bool good) {
+static void track_rest(mjxball_app *app, bool good) {
     float height = height_of(app);
     if (!good || !within(&app->low, 1, 2 * MOST_PLACE) || height < app->low - RESTING) {
         app->low = height;
@@ -173,7 +173,8 @@ static void watch_rest(mjxball_app *app, bool good) {
     }
 }
 
-static void judge_air(const mjxball_app *app, const seen *one, const mjxball_state *state, bool good, wish *to) {
+static void check_flight(const mjxball_app *app, const pair_state *pair, const mjxball_state *state, bool good,
+    request *to) {
     const bool guided = app->phase == MJXBALL_FLY || app->phase == MJXBALL_LAND;
     const uint32_t elapsed = app->now - app->since;
     float place[3], landing = (app->land_height + 0.3f) / LAND_SPEED + mjxball_rig.land_spare;
@@ -189,7 +190,7 @@ static void judge_air(const mjxball_app *app, const seen *one, const mjxball_sta
     if (app->phase == MJXBALL_LAND && (float)elapsed > 1000 * landing) ask(to, MJXBALL_DESCEND, MJXBALL_TIMEOUT);
     if (app->phase == MJXBALL_RAMP && elapsed > RAMP_TIME + LIFT_TIME) ask(to, MJXBALL_DESCEND, MJXBALL_TIMEOUT);
     if (app->phase == MJXBALL_DESCEND && elapsed > DESCEND_TIME) ask(to, MJXBALL_STOP, MJXBALL_TIMEOUT);
-    if (good && one->level < MOST_TILT) ask(to, MJXBALL_STOP, MJXBALL_TILT);
+    if (good && pair->level < MOST_TILT) ask(to, MJXBALL_STOP, MJXBALL_TILT);
     if (!state->can_fly) ask(to, MJXBALL_STOP, MJXBALL_CANNOT_FLY);
     if (peer_is_heard(app) && app->peer.phase == MJXBALL_IDLE) ask(to, MJXBALL_STOP, MJXBALL_PEER);
     if ((app->phase == MJXBALL_LAND || app->phase == MJXBALL_DESCEND) && elapsed >= SETTLED) {
@@ -200,11 +201,11 @@ static void judge_air(const mjxball_app *app, const seen *one, const mjxball_sta
     }
 }
 
-static void supervise(mjxball_app *app, uint8_t fault, const seen *one, const mjxball_state *state, bool good,
+static void supervise(mjxball_app *app, uint8_t fault, const pair_state *pair, const mjxball_state *state, bool good,
     const mjxball_map *map) {
     const uint32_t elapsed = app->now - app->since;
     const uint8_t order = laptop_is_heard(app) ? app->order : MJXBALL_IDLE;
-    wish to = {app->phase, app->cause};
+    request to = {app->phase, app->cause};
     if (app->phase == MJXBALL_IDLE) {
         app->refusal = refusal_of(app, fault, state);
         if (order == MJXBALL_SPIN && !app->refusal) enter(app, MJXBALL_SPIN, MJXBALL_ASKED, map);
@@ -223,15 +224,15 @@ static void supervise(mjxball_app *app, uint8_t fault, const seen *one, const mj
     } else {
         if (app->phase == MJXBALL_RAMP && elapsed >= RAMP_TIME && good && height_of(app) >= lifted_height(app))
             ask(&to, MJXBALL_FLY, MJXBALL_ASKED);
-        judge_air(app, one, state, good, &to);
+        check_flight(app, pair, state, good, &to);
     }
-    /* The law lands what it has flown. */
+    /* Only a controller that has flown lands. */
     if (app->phase == MJXBALL_SPIN && to.phase > MJXBALL_FLY) to.phase = MJXBALL_STOP;
     if (app->phase == MJXBALL_RAMP && to.phase == MJXBALL_LAND) to.phase = MJXBALL_DESCEND;
     if (to.phase != app->phase) enter(app, to.phase, to.cause, map);
 }
 
-/* Roll and pitch [rad] against the `velocity` sideways. */
+/* Roll and pitch [rad] against the horizontal `velocity`. */
 static void brake(const float *velocity, float *tilt) {
     float braking[3], command[3] = {0, 0, 0};
     for (int i = 0; i < 3; i++) braking[i] = -velocity[i] / 0.7f;
@@ -239,8 +240,8 @@ static void brake(const float *velocity, float *tilt) {
     for (int i = 0; i < 2; i++) tilt[i] = clip(command[i], -BRAKE_TILT, BRAKE_TILT);
 }
 
-/* Thrust rises until the pair is off the ground; the stick is held level, by what each drone sees for itself. */
-static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
+/* Raises thrust until the pair is off the ground and holds the stick level, each drone by its own estimate. */
+static void take_off(mjxball_app *app, const pair_state *pair, const mjxball_map *map, mjxball_setpoint *out) {
     const float period = (float)mjxball_rig.period / 1000, hover = hover_of(app, map);
     const float ramped = clip((float)(app->now - app->since) / (float)RAMP_TIME, 0, 1);
     float along[3] = {0, 0, 0}, turning[3], moving[3], tilt[2], length = 0, sine, angle, missing, off, apart;
@@ -249,7 +250,7 @@ static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, 
         length += along[i] * along[i];
     }
     for (int i = 0; i < 2; i++) along[i] /= root(length);
-    rotate(one, along, moving);
+    rotate(pair, along, moving);
     sine = clip(moving[2], -0.99f, 0.99f);
     angle = arctan(sine / root(1 - sine * sine));
     if (ramped < BEGIN) {
@@ -260,8 +261,8 @@ static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, 
         send_level(out, 0, 0, thrust);
         return;
     }
-    cross(one->rates, along, turning);
-    rotate(one, turning, moving);
+    cross(pair->rates, along, turning);
+    rotate(pair, turning, moving);
     brake(app->velocity, tilt);
     missing = CLIMB - app->velocity[2];
     app->share = clip(app->share + CLIMB_INTEGRAL * period * missing, 0, MOST_LIFT);
@@ -272,7 +273,7 @@ static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, 
         hover * (clip(app->share + CLIMB_GAIN * missing, 0, MOST_LIFT) + SIDE * apart));
 }
 
-/* Brake sideways and sink, by what is measured here and by the other drone; else by a model of the fall. */
+/* Brakes sideways and sinks, by the velocity estimates of both drones, or by a model of the fall without any. */
 static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
     const float period = (float)mjxball_rig.period / 1000;
     const float own = good && app->trusted, other = peer_is_heard(app) && app->peer.trusted;
@@ -284,20 +285,20 @@ static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
         app->climb = velocity[2];
         share = 1 + clip(-0.4f * (app->climb + SINK_SPEED), -0.3f, 0.1f);
     } else {
-        float wanted = clip(3 * (-BLIND_SPEED - app->climb), -3, -0.15f);
-        app->climb += wanted * period;
-        share = 1 + wanted / (float)MJXBALL_GRAVITY;
+        float acceleration = clip(3 * (-BLIND_SPEED - app->climb), -3, -0.15f);
+        app->climb += acceleration * period;
+        share = 1 + acceleration / (float)MJXBALL_GRAVITY;
     }
     app->height += app->climb * period;
     send_level(out, tilt[0], tilt[1], app->trim * share);
 }
 
-/* Nothing that was computed can be believed: level, sinking as a model of the fall does. */
+/* For invalid outputs: resets computed values and sinks level, by the model of the fall. */
 static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint *out) {
     if (app->phase < MJXBALL_DESCEND) enter(app, MJXBALL_DESCEND, MJXBALL_BAD_COMMAND, map);
     app->trusted = 0;
     app->peer_time = 0; /* until it is heard again */
-    for (int i = 0; i < 7; i++) app->integral[i] = 0; /* the other drone hears numbers only */
+    for (int i = 0; i < 7; i++) app->integral[i] = 0; /* the other drone receives finite values only */
     if (!within(app->velocity, 3, MOST_SPEED)) app->velocity[0] = app->velocity[1] = app->velocity[2] = 0;
     app->trim = hover_of(app, map);
     if (!within(&app->climb, 1, MOST_SPEED)) app->climb = 0;
@@ -305,7 +306,7 @@ static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint 
     descend(app, false, out);
 }
 
-static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
+static void fly(mjxball_app *app, const pair_state *pair, const mjxball_map *map, mjxball_setpoint *out) {
     const float period = (float)mjxball_rig.period / 1000, hover = hover_of(app, map);
     float goal[3];
     for (int i = 0; i < 3; i++) goal[i] = app->origin[i] + app->set.goal[i];
@@ -314,7 +315,7 @@ static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxba
         float sunk = LAND_SPEED * (float)(app->now - app->since) / 1000;
         goal[2] = app->origin[2] + clip(app->land_height - sunk, -1, 10);
     }
-    if (!fly_law(app, one, goal) || app->late > 10) {
+    if (!compute_command(app, pair, goal) || app->late > 10) {
         app->copying = 1;
         if (app->phase == MJXBALL_FLY) enter(app, MJXBALL_LAND, app->late > 10 ? MJXBALL_LATE : MJXBALL_BAD_COMMAND, map);
     }
@@ -349,7 +350,7 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
     const mjxball_map *map = &mjxball_rig.maps[app->set.curve == 1];
     const uint32_t gap = now - app->now;
     const bool good = state_is_good(state, now);
-    seen one = {.level = 1};
+    pair_state pair = {.level = 1};
     const mjxball_setpoint none = {0};
     *out = none;
     app->late = 0.99f * app->late + (app->started && gap >= 2u * (uint32_t)mjxball_rig.period ? 1.0f : 0.0f);
@@ -357,15 +358,15 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
     app->now = now;
     if (is_charged(app, state)) app->charged = now;
     if (good) {
-        look(app->set.mount, state, &one);
+        estimate_pair(app->set.mount, state, &pair);
         for (int i = 0; i < 3; i++) {
-            app->position[i] = one.position[i];
-            app->velocity[i] = one.velocity[i];
+            app->position[i] = pair.position[i];
+            app->velocity[i] = pair.velocity[i];
         }
     }
     if (app->phase > MJXBALL_SPIN && !estimate_is_good(state)) app->trusted = 0;
-    watch_rest(app, good);
-    supervise(app, fault, &one, state, good, map);
+    track_rest(app, good);
+    supervise(app, fault, &pair, state, good, map);
     switch (app->phase) {
     case MJXBALL_IDLE:
         break;
@@ -373,11 +374,11 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
         send_level(out, 0, 0, SPIN_THRUST);
         break;
     case MJXBALL_RAMP:
-        take_off(app, &one, map, out);
+        take_off(app, &pair, map, out);
         break;
     case MJXBALL_FLY:
     case MJXBALL_LAND:
-        fly(app, &one, map, out);
+        fly(app, &pair, map, out);
         break;
     case MJXBALL_DESCEND:
         descend(app, good, out);
@@ -386,7 +387,7 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
         out->active = true; /* thrust 0 */
         return;
     }
-    /* The last step before the commander. */
+    /* Last check before the commander. */
     if (out->active && !setpoint_is_good(out)) distrust(app, map, out);
     out->thrust = (float)(int)(out->thrust + 0.5f);
 }

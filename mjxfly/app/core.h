@@ -1,7 +1,7 @@
-/* One drone of a pair on board: laws, supervisor, peer to peer, upload. Pure functions over structs, no firmware types.
+/* One drone of a pair on board: controllers, supervisor, peer to peer, upload. Functions on structs, no firmware types.
  *
  * Compiled once with MJXBALL_FOLLOWER 0 for the leader (PID) and once with 1 for the follower (policy). `policy.h` and
- * `rig.h` are made from a policy file. SI units, radians, world axes; times in milliseconds of the drone's clock.
+ * `rig.h` are generated from a policy file. SI units, radians, world axes; times in milliseconds of the drone's clock.
  */
 #ifndef MJXBALL_CORE_H
 #define MJXBALL_CORE_H
@@ -11,25 +11,25 @@
 
 #include "policy.h"
 
-/* Weights can be uploaded to a follower that has them as whole numbers. */
+/* Only a follower with integer weights accepts uploads. */
 #if MJXBALL_FOLLOWER && defined(MJXBALL_INT8)
 #define MJXBALL_UPLOADS 1
 #else
 #define MJXBALL_UPLOADS 0
 #endif
 
-/* In order of precedence: a drone moves on to the furthest of its own, the laptop's and the other drone's. */
+/* In order of precedence: a drone enters the highest phase that itself, the laptop or the other drone requests. */
 typedef enum {
-    MJXBALL_IDLE,     /* nothing is sent: the laptop's setpoints hold */
+    MJXBALL_IDLE,     /* no setpoints: those of the laptop are executed */
     MJXBALL_SPIN,     /* level, a third of hover */
     MJXBALL_RAMP,     /* level, thrust rising to hover */
-    MJXBALL_FLY,      /* the law */
-    MJXBALL_LAND,     /* the law toward a goal that sinks */
+    MJXBALL_FLY,      /* controller */
+    MJXBALL_LAND,     /* controller with a sinking goal */
     MJXBALL_DESCEND,  /* braking sideways, sinking */
     MJXBALL_STOP,     /* motors off, until the firmware no longer counts as flying */
 } mjxball_phase;
 
-/* Why a drone does not start, or why it moved on. `rig.h` has a sentence for each, of `protocol.CAUSES`. */
+/* Why a drone does not start, or entered its phase. `rig.h` has a sentence for each, from `protocol.CAUSES`. */
 typedef enum {
     MJXBALL_GOOD,
     MJXBALL_ASKED,       /* by the laptop */
@@ -58,37 +58,37 @@ typedef enum {
 } mjxball_cause;
 
 typedef struct {
-    float hover, per_acceleration; /* the paper's law [thrust units, thrust units per m/s2] */
+    float hover, per_acceleration; /* the paper's thrust map [thrust units, thrust units per m/s2] */
     float quadratic, linear;       /* force of a motor at p = thrust / 65535: quadratic p^2 + linear p [N] */
     int known;                     /* whether the policy flies with firmware of this force curve */
 } mjxball_map;
 
-/* What `rig.h` holds. */
+/* Contents of `rig.h`. */
 typedef struct {
-    uint32_t ident;        /* of the weights: CRC */
-    uint32_t key;          /* of all but weights: both drones and an upload must agree */
-    int period;            /* of the law [ms] */
+    uint32_t ident;        /* CRC of the weights */
+    uint32_t key;          /* compatibility key, without the weights: both drones and an upload must agree */
+    int period;            /* of the controller [ms] */
     float mount[2][3];     /* of leader and follower as trained [m] */
 #ifdef MJXBALL_MOUNT_ANGLE
-    float mount_frame[2];  /* cosine and sine of the angle about body z by which the policy's axes are turned */
+    float mount_frame[2];  /* cosine and sine of the angle about body z by which the policy's axes are rotated */
 #endif
-    float carried[2];      /* mass that each believes it lifts [kg] */
-    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain; /* the leader's law, see sim/laws.py */
-    int axis;              /* 0 roll, 1 pitch: what the load turns */
-    float lift_sign;       /* of the axis: a leader that lifts more turns the stick up or down */
-    int shares;            /* the follower's base is the leader's PID */
+    float carried[2];      /* nominal mass that each drone lifts [kg] */
+    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain; /* the leader's controller, see sim/laws.py */
+    int axis;              /* of the load's moment: 0 roll, 1 pitch */
+    float lift_sign;       /* sign of the rotation about the axis if the leader lifts more */
+    int shares;            /* the follower adds to the leader's PID, whose integrals it receives */
     int stand;             /* only height and roll are free */
-    int own_error;         /* the leader flies on its own place's error */
-    int paper;             /* thrust law */
+    int own_error;         /* the leader's error is that of its mount, not of O */
+    int paper;             /* 1: thrust by the paper's map, 0: by the force curve */
     float goal[3];         /* from the start [m] */
     float fence_low[3], fence_high[3];
     float land_spare;      /* [s] */
     float battery;         /* [V] */
     mjxball_map maps[2];   /* firmware with battery compensation, and without */
-} mjxball_rig_numbers;
+} mjxball_rig_parameters;
 
 typedef struct {
-    float goal[3];  /* of O from where it stood at the start [m] */
+    float goal[3];  /* of O from its start [m] */
     float mount[3]; /* of this drone from O, body axes [m]; 0 0 0: not set */
     uint8_t curve;  /* of the firmware: 0 linear, 1 older */
     float battery;  /* land below it [V] */
@@ -113,31 +113,31 @@ typedef struct {
 #define MJXBALL_BEAT_SIZE 40
 #define MJXBALL_REPLY_SIZE 8
 
-/* What a drone hears from the other one. */
+/* Heartbeat of the other drone. */
 typedef struct {
     uint32_t key;
     uint8_t phase, trusted;
-    float integral[4]; /* of the leader: its error [m s], the stick's angle error [rad s] */
+    float integral[4]; /* of the leader: position error [m s], error of the stick's angle [rad s] */
     float velocity[3]; /* of O [m/s] */
-    float apart;       /* of its take-off [share of hover] */
+    float apart;       /* half difference of the drones' lifts that its take-off found [hover] */
 } mjxball_beat;
 
 typedef struct {
     uint8_t phase, cause, refusal, order;
-    uint8_t copying;  /* the copying law flies in the network's place */
-    uint8_t trusted;  /* its own estimate */
+    uint8_t copying;  /* the fallback controller replaces the network */
+    uint8_t trusted;  /* the estimate of this drone can be used */
     uint8_t started;
     uint32_t since, now, laptop_time, peer_time, saturated_since, charged;
-    float late;       /* ticks that came late, forgotten within a second or so */
+    float late;       /* number of late ticks, with exponential decay within about a second */
     mjxball_parameters set; /* in use */
     float origin[3], land_height;
     float position[3], velocity[3]; /* of O */
     float integral[7];
-    float trim;       /* thrust that hovers [thrust units] */
-    float climb, height; /* of a descent that is flown blind */
-    float share, apart, resting; /* of the take-off: lift of both, their difference [shares of hover], the stick's angle [rad] */
-    float needed; /* force by which this drone hovers with the stick level, of what the card says, as the take-off found it */
-    uint32_t low_since; /* it has not sunk since then by more than RESTING from `low` [m] */
+    float trim;       /* hover thrust [thrust units] */
+    float climb, height; /* model of a descent without estimates */
+    float share, apart, resting; /* of the take-off: mean lift, half difference [hover], angle at rest [rad] */
+    float needed; /* hover force of this drone with a level stick over the nominal one, found by the take-off */
+    uint32_t low_since; /* since then it has not sunk more than RESTING below `low` [m] */
     float low;
     float action[3], command[3];
     mjxball_beat peer;
@@ -149,22 +149,22 @@ typedef struct {
 } mjxball_app;
 
 const char *mjxball_text(int cause);
-/* The law's period [ms], and the CRC of the weights in use. */
+/* The controller's period [ms], and the CRC of the weights in use. */
 int mjxball_period(void);
 uint32_t mjxball_ident(const mjxball_app *app);
-/* Parameters as they are at boot: the policy's goal and drone, no mount. */
+/* Parameters at boot: the policy's goal and battery limit, no mount. */
 void mjxball_defaults(mjxball_parameters *set);
 void mjxball_start(mjxball_app *app, uint32_t now);
 /* Once a period. */
 void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball_state *state, uint32_t now,
     mjxball_setpoint *out);
-/* The heartbeat for the other drone, and one that came from there. */
+/* Writes the heartbeat for the other drone; handles one of the other drone. */
 void mjxball_send(const mjxball_app *app, uint8_t out[MJXBALL_BEAT_SIZE]);
 void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now);
-/* A packet of the laptop; the length of what is to be answered, 0 for nothing. `memory` holds uploaded weights. */
+/* Handles a packet of the laptop; returns the reply's length, 0 for none. `memory` holds uploaded weights. */
 int mjxball_laptop(mjxball_app *app, const uint8_t *data, int size, uint32_t now, uint8_t *memory,
     uint8_t reply[MJXBALL_REPLY_SIZE]);
-/* Bytes that uploaded weights need, 0 where there can be none. */
+/* Bytes of uploaded weights, 0 without uploads. */
 uint32_t mjxball_upload_size(void);
 
 #endif

@@ -1,4 +1,4 @@
-"""A policy as apps for two Crazyflies: our C for both, and the few files that the firmware's build needs."""
+"""Generation of the apps of two Crazyflies from a policy: C sources, headers, files of the firmware's build."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from mjxfly.app.protocol import CAUSES
 from mjxfly.setpoints import CURVE_NAMES
 from mjxfly.telemetry import Rig
 
-CORE = ("core.h", "core.c", "checks.h", "laws.h", "packets.h")  # no firmware types
+CORE = ("core.h", "core.c", "checks.h", "laws.h", "packets.h")  # without firmware types
 SOURCES = (*CORE, "glue.c")
 ROLES = ("leader", "follower")
-PERIODS = (5, 20)  # [ms] of laws that an app may keep
-STACK = 2400  # [bytes] of the app's task beside the network's arrays
-# Fields of a card beside the weights that leader, follower and an upload must share.
+PERIODS = (5, 20)  # [ms] shortest and longest control period of an app
+STACK = 2400  # [bytes] of the app's task without the network's arrays
+# Metadata, besides the weights' shapes, in which leader, follower and an upload must agree.
 SAME = (
     "history",
     "previous_action",
@@ -46,29 +46,29 @@ EXACT = ("-ffp-contract=off", "-fno-math-errno")
 
 
 def sources() -> Path:
-    """Directory of the C files that do not depend on the policy."""
+    """Return the directory of the C files that do not depend on the policy."""
     return Path(__file__).parent
 
 
 def options(int8: bool) -> tuple[str, ...]:
-    """gcc's options for `core.c`: float32 is smaller and no slower for size, weights of 8 bits need speed."""
+    """Return gcc's options for `core.c`: 8 bit weights need -O2; with float32, -Os is smaller and no slower."""
     return ("-O2" if int8 else "-Os", *EXACT)
 
 
 def key_of(policy: PolicyFile) -> int:
-    """A number of everything but the weights: what follower, leader and an upload must agree in."""
-    known = {name: policy.card.get(name) for name in SAME}
-    sizes = [array.shape for array in (*policy.weights, *(policy.gru or ()))]
-    return zlib.crc32(json.dumps([known, sizes], sort_keys=True).encode())
+    """Return the compatibility key: a CRC of `SAME` and the weights' shapes, not of the weights."""
+    fields = {name: policy.card.get(name) for name in SAME}
+    shapes = [array.shape for array in (*policy.weights, *(policy.gru or ()))]
+    return zlib.crc32(json.dumps([fields, shapes], sort_keys=True).encode())
 
 
 def ident_of(policy: PolicyFile, int8: bool) -> int:
-    """CRC of the weights as they are on board."""
+    """Return the CRC of the weights in their encoding on board."""
     return zlib.crc32(weight_bytes(policy) if int8 else float_bytes(policy))
 
 
 def check_policy(policy: PolicyFile, name: str) -> Config:
-    """The configuration of a policy that can fly on board. Raises InputError for another plant or rate."""
+    """Return the configuration of a policy that can fly on board. Raises InputError for another plant or period."""
     plant = policy.card["plant"]
     drones = plant.get("drones", ())
     if policy.card.get("firmware") is None or (drones and len(drones) != 2):
@@ -81,8 +81,8 @@ def check_policy(policy: PolicyFile, name: str) -> Config:
 
 
 def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
-    """`rig.h`: the numbers of both laws and of the supervisor, and a sentence for each of its causes."""
-    law, plant, stand = config.leader, config.plant, config.plant.stand != "free"
+    """Return `rig.h`: parameters of both controllers and of the supervisor, and a sentence for each `CAUSES`."""
+    leader, plant, stand = config.leader, config.plant, config.plant.stand != "free"
     goal, rig = card.goal_of(config), Rig.of_plant(config.plant)
     bounds = card.limits_of(config, goal)
     variants = card.variants(config)
@@ -96,17 +96,17 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "mount": [rig.leader_mount, rig.follower_mount],
         **({"mount_frame": [math.cos(angle), math.sin(angle)]} if "team" in policy.card else {}),
         "carried": [own[first].map.carried_mass for own in variants],
-        "kp": law.kp,
-        "kd": law.kd,
-        "ki": law.ki,
-        "band": law.integral_error_limit,
-        "lead": law.integral_lead_time,
-        "tilt_gain": law.tilt_integral_gain,
+        "kp": leader.kp,
+        "kd": leader.kd,
+        "ki": leader.ki,
+        "band": leader.integral_error_limit,
+        "lead": leader.integral_lead_time,
+        "tilt_gain": leader.tilt_integral_gain,
         "axis": axis,
         "lift_sign": (1.0, -1.0)[axis],
         "shares": int(config.follower.residual_on_pid),
         "stand": int(stand),
-        "own_error": int(law.error != "object"),
+        "own_error": int(leader.error != "object"),
         "paper": int(config.autopilot.thrust_law == "paper"),
         "goal": goal,
         "fence_low": bounds.fence_low,
@@ -118,16 +118,17 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
     lines = ",\n".join(f"    .{name} = {_literal(value)}" for name, value in fields.items())
     causes = ",\n".join(f'    "{text}"' for text in CAUSES)
     return (
-        f"/* See core.h. */\n#pragma once\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n\n"
+        f"/* See core.h. */\n#pragma once\nstatic const mjxball_rig_parameters mjxball_rig = {{\n{lines},\n}};\n\n"
         f"static const char *const mjxball_texts[MJXBALL_CAUSES] = {{\n{causes},\n}};\n"
     )
 
 
 def _map(variant: Any) -> list[Any]:
+    """Fields of `mjxball_map`; `variant` None: a force curve with which the policy does not fly."""
     if variant is None:
         return [1.0, 0.0, 0.0, 1.0, 0]
-    own = variant.map
-    return [own.hover, own.per_acceleration, own.curve.quadratic, own.curve.linear, 1]
+    thrust = variant.map
+    return [thrust.hover, thrust.per_acceleration, thrust.curve.quadratic, thrust.curve.linear, 1]
 
 
 def _literal(value: Any) -> str:
@@ -139,7 +140,7 @@ def _literal(value: Any) -> str:
 
 
 def files_of(policy: PolicyFile, name: str, int8: bool) -> Mapping[str, str]:
-    """Every file of the apps by its path. Raises InputError if the policy cannot fly on board."""
+    """Return the contents of all files of the apps by path. Raises InputError if the policy cannot fly on board."""
     config = check_policy(policy, name)
     cost = footprint(policy, int8)
     files = {f"src/{one}": (sources() / one).read_text(encoding="utf-8") for one in SOURCES}
@@ -166,7 +167,7 @@ def files_of(policy: PolicyFile, name: str, int8: bool) -> Mapping[str, str]:
 
 
 def check_place(place: Path) -> None:
-    """Raise InputError unless a directory can be made at `place`."""
+    """Raise InputError unless a directory can be created at `place`."""
     if place.exists():
         raise InputError(f"{place} exists; choose another name")
     if not place.absolute().parent.is_dir():
@@ -174,7 +175,7 @@ def check_place(place: Path) -> None:
 
 
 def write_app(policy: PolicyFile, name: str, place: Path, int8: bool = False) -> None:
-    """Write the apps of `policy` to the new directory `place`. Raises InputError; nothing is left behind then."""
+    """Write the apps of `policy` to the new directory `place`, or nothing and raise InputError."""
     check_place(place)
     files = files_of(policy, name, int8)
     with tempfile.TemporaryDirectory(dir=place.absolute().parent, prefix=".app-") as partial:
@@ -206,7 +207,7 @@ README = """\
 # {name} on board
 
 Made by `python -m mjxfly.app POLICY DIR` (configuration {hash}, {weights} weights, {flash} bytes of
-constants, a law every {period} ms, number {ident}).
+constants, control period {period} ms, CRC of the weights {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`
 with `checks.h`, `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's

@@ -1,7 +1,7 @@
-/* The core on a Crazyflie: what the firmware's public interface gives and takes. Facts of its release 2026.08.
+/* The core on a Crazyflie, by the public interface of the firmware 2026.08.
  *
- * The stabilizer's loop only hands the state over and goes on with the firmware's own PID; law and network run in the
- * app's task, whose priority is below, and send setpoints to the commander as a radio would.
+ * The out-of-tree controller only copies the state and then calls the firmware's PID. Controller and network run in the
+ * app's task, which has a lower priority, and send setpoints to the commander.
  */
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -42,13 +42,13 @@ static mjxball_weights uploaded;
 #define MEMORY ((uint8_t *)0)
 #endif
 
-/* What tasks of higher priority write, and how often they did. */
+/* Written by tasks of higher priority, with the number of writes. */
 static volatile uint32_t stateCount, beatCount;
 static mjxball_state newest;
 static uint8_t beat[MJXBALL_BEAT_SIZE];
 
-/* Copies it, again if it was written meanwhile, and tells of which `count` it is. */
-static uint32_t take(void *to, const void *from, size_t size, const volatile uint32_t *count) {
+/* Copies data of another task, again if it was written meanwhile; returns its `count`. */
+static uint32_t copy_consistent(void *to, const void *from, size_t size, const volatile uint32_t *count) {
     uint32_t before;
     do {
         before = *count;
@@ -89,7 +89,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     controllerPid(control, setpoint, sensors, state, stabilizerStep);
 }
 
-static void heard(P2PPacket *packet) {
+static void on_heartbeat(P2PPacket *packet) {
     if (packet->size != MJXBALL_BEAT_SIZE) return;
     memcpy(beat, packet->data, MJXBALL_BEAT_SIZE);
     atomic_signal_fence(memory_order_seq_cst);
@@ -124,13 +124,13 @@ static void receive(uint32_t now) {
         if (answer) appchannelSendDataPacket(reply, (size_t)answer);
     }
     if (beats == beatCount) return;
-    beats = take(word, beat, sizeof word, &beatCount);
+    beats = copy_consistent(word, beat, sizeof word, &beatCount);
     mjxball_hear(&core, word, sizeof word, now);
 }
 
-static void say(void) {
+static void print_changes(void) {
     static uint8_t phase, refusal;
-    const uint8_t refused = core.order == MJXBALL_SPIN ? core.refusal : MJXBALL_GOOD; /* before, nobody asks */
+    const uint8_t refused = core.order == MJXBALL_SPIN ? core.refusal : MJXBALL_GOOD; /* only if a start is requested */
     if (refused != refusal && refused) DEBUG_PRINT("refused: %s\n", mjxball_text(refused));
     if (core.phase != phase) DEBUG_PRINT("phase %d: %s\n", core.phase, mjxball_text(core.cause));
     refusal = refused;
@@ -145,7 +145,7 @@ void appMain(void) {
     period = (uint8_t)mjxball_period();
     mjxball_defaults(&set);
     mjxball_start(&core, T2M(wake));
-    p2pRegisterCB(heard);
+    p2pRegisterCB(on_heartbeat);
     for (uint32_t tick = 0;; tick++) {
         uint64_t begun;
         uint32_t now;
@@ -154,17 +154,17 @@ void appMain(void) {
         mjxball_parameters asked;
         vTaskDelayUntil(&wake, M2T(mjxball_period()));
         begun = usecTimestamp();
-        take(&state, &newest, sizeof state, &stateCount);
-        asked = set; /* which another task writes: one copy a period */
+        copy_consistent(&state, &newest, sizeof state, &stateCount);
+        asked = set; /* one copy a period, since another task writes it */
         atomic_signal_fence(memory_order_seq_cst);
-        now = T2M(xTaskGetTickCount()); /* never before the state */
+        now = T2M(xTaskGetTickCount()); /* after the copy, so that it is not before the state's time */
         receive(now);
         for (int i = 0; i < 3; i++) state.variance[i] = logGetFloat(variances[i]);
         state.voltage = logGetFloat(voltage);
         state.can_fly = supervisorCanFly();
         mjxball_tick(&core, &asked, &state, now, &wanted);
         send(&wanted);
-        say();
+        print_changes();
         if (tick % BEAT_TICKS == 0) {
             P2PPacket packet;
             memset(&packet, 0, sizeof packet);
@@ -190,18 +190,18 @@ PARAM_ADD(PARAM_UINT8, curve, &set.curve)     /* of the firmware: 0 linear, 1 ol
 PARAM_ADD(PARAM_FLOAT, battery, &set.battery) /* land below it [V] */
 PARAM_ADD(PARAM_UINT32 | PARAM_RONLY, ident, &ident)   /* CRC of the weights in use */
 PARAM_ADD(PARAM_UINT8 | PARAM_RONLY, role, &role)      /* 0 leader, 1 follower */
-PARAM_ADD(PARAM_UINT8 | PARAM_RONLY, period, &period)  /* of the law [ms] */
+PARAM_ADD(PARAM_UINT8 | PARAM_RONLY, period, &period)  /* of the controller [ms] */
 PARAM_GROUP_STOP(mjxb)
 
 LOG_GROUP_START(mjxb)
 LOG_ADD(LOG_UINT8, phase, &core.phase)        /* see core.h */
 LOG_ADD(LOG_UINT8, cause, &core.cause)        /* of the phase */
-LOG_ADD(LOG_UINT8, refusal, &core.refusal)    /* why it would not start */
-LOG_ADD(LOG_UINT8, copying, &core.copying)    /* 1: the copying law flies */
-LOG_ADD(LOG_FLOAT, late, &core.late)          /* late ticks, lately */
-LOG_ADD(LOG_UINT32, used, &used)              /* time of a tick [us] */
-LOG_ADD(LOG_UINT32, laptopAge, &laptopAge)    /* since its last order [ms] */
-LOG_ADD(LOG_UINT32, peerAge, &peerAge)        /* since its last heartbeat [ms] */
+LOG_ADD(LOG_UINT8, refusal, &core.refusal)    /* why it does not start */
+LOG_ADD(LOG_UINT8, copying, &core.copying)    /* 1: the fallback controller flies */
+LOG_ADD(LOG_FLOAT, late, &core.late)          /* recent late ticks */
+LOG_ADD(LOG_UINT32, used, &used)              /* computing time of a tick [us] */
+LOG_ADD(LOG_UINT32, laptopAge, &laptopAge)    /* since the laptop's last request [ms] */
+LOG_ADD(LOG_UINT32, peerAge, &peerAge)        /* since the other drone's last heartbeat [ms] */
 LOG_ADD(LOG_FLOAT, roll, &core.command[0])    /* commanded [rad] */
 LOG_ADD(LOG_FLOAT, pitch, &core.command[1])
 LOG_ADD(LOG_FLOAT, az, &core.command[2])      /* [m/s2] */

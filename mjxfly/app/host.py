@@ -1,4 +1,4 @@
-"""The apps' C compiled for this computer, one drone each: what the twin flies is what will fly."""
+"""The apps' C code compiled for this computer, one shared library for each role, for the twin."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FLAGS = (
     *("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror"),
     *("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic"),
 )
-# Beside the core: what Python must know of structs that it does not spell out.
+# Accessors of the fields of `mjxball_app`, whose layout Python does not know.
 ACCESS = """\
 #include "core.c"
 uint32_t mjxball_size(void) { return sizeof(mjxball_app); }
@@ -58,7 +58,7 @@ class State(ctypes.Structure):
     )
 
 
-class Wanted(ctypes.Structure):
+class AppSetpoint(ctypes.Structure):
     """`mjxball_setpoint`."""
 
     _fields_ = (
@@ -70,7 +70,7 @@ class Wanted(ctypes.Structure):
 
 
 class Library:
-    """The core of one role, as a shared library."""
+    """The compiled core of one role; attribute `x` is the C function `mjxball_x`."""
 
     def __init__(self, path: Path):
         self._library = ctypes.CDLL(str(path))
@@ -89,7 +89,7 @@ class Library:
 
 
 def compile_pair(policy: PolicyFile, name: str, int8: bool = False) -> tuple[Library, Library]:
-    """The cores of leader and follower for `policy`. Raises InputError without gcc, or for a policy that cannot fly."""
+    """Compile the cores of leader and follower. Raises InputError without gcc, or for a policy that cannot fly."""
     files = files_of(policy, name, int8)
     if shutil.which("gcc") is None:
         raise InputError("the twin runs the app's C, which needs gcc: install it, or leave --onboard out")
@@ -118,7 +118,7 @@ class App:
         self._memory = ctypes.create_string_buffer(max(library.upload_size(), 1))
         self._set = Parameters()
         self.period = int(library.period())
-        self.thrust = 0.0  # that was sent last
+        self.thrust = 0.0  # of the last setpoint [thrust units]
         library.defaults(ctypes.byref(self._set))
         library.start(self._core, ctypes.c_uint32(now))
 
@@ -130,16 +130,16 @@ class App:
             getattr(self._set, name[:-1])["XYZ".index(name[-1])] = value
 
     def parameters(self) -> Mapping[str, float]:
-        """All parameters by name."""
-        places = {
+        """Return all parameters by name."""
+        vectors = {
             f"{what}{axis}": getattr(self._set, what)[i] for what in ("goal", "mount") for i, axis in enumerate("XYZ")
         }
-        others = {"curve": self._set.curve, "battery": self._set.battery}
-        return {**places, **others, "ident": self.ident, "role": self.role, "period": self.period}
+        scalars = {"curve": self._set.curve, "battery": self._set.battery}
+        return {**vectors, **scalars, "ident": self.ident, "role": self.role, "period": self.period}
 
-    def tick(self, state: State, now: int) -> Wanted:
-        """Once a period: what it sends to the commander."""
-        wanted = Wanted()
+    def tick(self, state: State, now: int) -> AppSetpoint:
+        """Run one period; return the setpoint for the commander."""
+        wanted = AppSetpoint()
         self._c.tick(
             self._core, ctypes.byref(self._set), ctypes.byref(state), ctypes.c_uint32(now), ctypes.byref(wanted)
         )
@@ -147,34 +147,34 @@ class App:
         return wanted
 
     def send(self) -> bytes:
-        """The heartbeat for the other drone."""
+        """Return the heartbeat for the other drone."""
         out = ctypes.create_string_buffer(BEAT_SIZE)
         self._c.send(self._core, out)
         return out.raw
 
     def hear(self, data: bytes, now: int) -> None:
-        """A heartbeat of the other drone."""
+        """Handle a heartbeat of the other drone."""
         self._c.hear(self._core, data, len(data), ctypes.c_uint32(now))
 
     def laptop(self, data: bytes, now: int) -> bytes:
-        """A packet of the laptop; the answer, empty if there is none."""
+        """Handle a packet of the laptop; return the answer, empty for none."""
         reply = ctypes.create_string_buffer(REPLY_SIZE)
         size = self._c.laptop(self._core, data, len(data), ctypes.c_uint32(now), self._memory, reply)
         return reply.raw[:size]
 
     @property
     def phase(self) -> Phase:
-        """Where it is."""
+        """The app's phase."""
         return Phase(self._core.raw[0])
 
     @property
     def command(self) -> Sequence[float]:
-        """(3,) what its law commanded last: roll, pitch [rad], vertical acceleration [m/s2]."""
+        """(3,) last command of its controller: roll, pitch [rad], vertical acceleration [m/s2]."""
         return list(self._c.command(self._core)[:3])
 
     @property
     def integral(self) -> Sequence[float]:
-        """(7,) see `sim.laws.Laws`."""
+        """(7,) integrals of the controllers, see `sim.laws.Laws`."""
         return list(self._c.integral(self._core)[:7])
 
     @property
@@ -183,7 +183,7 @@ class App:
         return int(self._c.ident(self._core))
 
     def logged(self) -> Mapping[str, float]:
-        """Log variables of the group mjxb."""
+        """Return the log variables of the group mjxb that Python can read."""
         phase, cause, refusal, _, copying = self._core.raw[:5]
         values = {"phase": phase, "cause": cause, "refusal": refusal, "copying": copying}
         return values | dict(zip(("roll", "pitch", "az"), self.command, strict=True)) | {"thrust": self.thrust}

@@ -1,4 +1,4 @@
-/* The laws of one drone: what it sees of the pair, the leader's PID, the follower's network. Part of core.c. */
+/* Controllers of pair drone: its estimate of the pair, the leader's PID, the follower's network. Part of core.c. */
 #ifndef MJXBALL_LAWS_H
 #define MJXBALL_LAWS_H
 
@@ -10,15 +10,15 @@
 #define WASHOUT_TIME 8.0f /* [s] */
 #define MOST_INTEGRAL 1000.0f    /* [m s] of the leader's error */
 
-/* Numbers. */
+/* Arithmetic. */
 
-/* What is not finite stays so. */
+/* Values that are not finite are returned unchanged. */
 static float clip(float value, float low, float high) {
     if (!mjxball_are_finite(&value, 1)) return value;
     return value < low ? low : value > high ? high : value;
 }
 
-/* By their bits, which are in the order of values: false for NaN, too. */
+/* Whether all magnitudes are at most `limit`, by their bits, which are ordered like the values; false for NaN. */
 static bool within(const float *values, int count, float limit) {
     return mjxball_most(values, count) <= mjxball_most(&limit, 1);
 }
@@ -27,7 +27,7 @@ static float root(float x) {
     return x > 0 ? __builtin_sqrtf(x) : 0;
 }
 
-/* Odd Taylor sum within tan(pi / 8), where it is exact to float. */
+/* Taylor series up to tan(pi / 8), where it is exact to float; larger arguments are reduced. */
 static float arctan(float x) {
     float size = x < 0 ? -x : x, base = 0, square, value = 0;
     if (size > 2.4142135f) {
@@ -74,20 +74,20 @@ static void cross(const float *a, const float *b, float *to) {
     to[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* The pair as this drone sees it. */
+/* The pair's state by this drone's estimate. */
 
 typedef struct {
     float position[3], velocity[3], euler[3], rates[3], matrix[3][3]; /* of O */
     float level; /* cosine of the drone's tilt */
-} seen;
+} pair_state;
 
-static void rotate(const seen *by, const float *vector, float *to) {
+static void rotate(const pair_state *by, const float *vector, float *to) {
     for (int i = 0; i < 3; i++)
         to[i] = by->matrix[i][0] * vector[0] + by->matrix[i][1] * vector[1] + by->matrix[i][2] * vector[2];
 }
 
-/* p_O = p - R r, with r `mount`. On a stand nothing is believed of what is locked. */
-static void look(const float *mount, const mjxball_state *state, seen *to) {
+/* p_O = p - R r, with r `mount`. On a stand the locked coordinates are 0. */
+static void estimate_pair(const float *mount, const mjxball_state *state, pair_state *to) {
     float arm[3], swing[3], sweep[3];
     rotation(state->quaternion, to->matrix);
     rotate(to, mount, arm);
@@ -110,31 +110,31 @@ static void look(const float *mount, const mjxball_state *state, seen *to) {
     }
 }
 
-/* A place and its motion relative to O, as the laws see them: 0 along what a stand locks. */
-static void arm_of(const seen *one, const float *mount, float *arm, float *sweep) {
+/* Position and velocity of a mount relative to O, 0 in the locked coordinates of a stand. */
+static void arm_of(const pair_state *pair, const float *mount, float *arm, float *sweep) {
     float swing[3];
-    rotate(one, mount, arm);
-    cross(one->rates, mount, swing);
-    rotate(one, swing, sweep);
+    rotate(pair, mount, arm);
+    cross(pair->rates, mount, swing);
+    rotate(pair, swing, sweep);
     if (mjxball_rig.stand) arm[0] = arm[1] = sweep[0] = sweep[1] = 0;
 }
 
 #if MJXBALL_FOLLOWER
-static void observe(const seen *one, const float *goal, float *to) {
+static void observe(const pair_state *pair, const float *goal, float *to) {
     float arm[3], sweep[3];
-    arm_of(one, mjxball_rig.mount[1], arm, sweep);
+    arm_of(pair, mjxball_rig.mount[1], arm, sweep);
     for (int i = 0; i < 3; i++) {
-        to[i] = one->position[i] + arm[i];
-        to[3 + i] = one->euler[i];
-        to[6 + i] = one->velocity[i] + sweep[i];
-        to[9 + i] = one->rates[i];
-        to[12 + i] = goal[i] - one->position[i];
-        to[15 + i] = -one->velocity[i];
+        to[i] = pair->position[i] + arm[i];
+        to[3 + i] = pair->euler[i];
+        to[6 + i] = pair->velocity[i] + sweep[i];
+        to[9 + i] = pair->rates[i];
+        to[12 + i] = goal[i] - pair->position[i];
+        to[15 + i] = -pair->velocity[i];
     }
 }
 
 #ifdef MJXBALL_MOUNT_ANGLE
-/* Every three of `count` numbers as a vector, turned about z by an angle of this cosine and sine. */
+/* Rotates `count` / 3 vectors about z by the angle with cosine `c` and sine `s`. */
 static void turn(float *vectors, int count, float c, float s) {
     for (int k = 0; k + 1 < count; k += 3) {
         float x = vectors[k], y = vectors[k + 1];
@@ -145,7 +145,7 @@ static void turn(float *vectors, int count, float c, float s) {
 #endif
 #endif
 
-/* Laws, as in sim/laws.py. */
+/* Controllers, as in sim/laws.py. */
 
 static void clip_command(float *command) {
     for (int i = 0; i < 3; i++) command[i] = clip(command[i], -mjxball_limit[i], mjxball_limit[i]);
@@ -158,12 +158,12 @@ static void command_of(const float *acceleration, float *command) {
     clip_command(command);
 }
 
-static void leader_error(const seen *one, const float *goal, float *error, float *rate) {
+static void leader_error(const pair_state *pair, const float *goal, float *error, float *rate) {
     float arm[3], sweep[3];
-    arm_of(one, mjxball_rig.mount[0], arm, sweep);
+    arm_of(pair, mjxball_rig.mount[0], arm, sweep);
     for (int i = 0; i < 3; i++) {
-        error[i] = goal[i] - one->position[i];
-        rate[i] = -one->velocity[i];
+        error[i] = goal[i] - pair->position[i];
+        rate[i] = -pair->velocity[i];
         if (mjxball_rig.own_error) {
             error[i] += mjxball_rig.stand && i < 2 ? 0 : mjxball_rig.mount[0][i] - arm[i];
             rate[i] -= sweep[i];
@@ -172,36 +172,36 @@ static void leader_error(const seen *one, const float *goal, float *error, float
 }
 
 static void pid(const float *error, const float *rate, const float *integral, float *command) {
-    float wanted[3];
+    float acceleration[3];
     for (int i = 0; i < 3; i++)
-        wanted[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
-    command_of(wanted, command);
+        acceleration[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
+    command_of(acceleration, command);
 }
 
 /* Bound of the leader's integral of the stick's angle [rad s]. */
-static float most_turn(void) {
+static float tilt_integral_limit(void) {
     return mjxball_rig.tilt_gain > 0 ? MAX_LIFT_DIFFERENCE / mjxball_rig.tilt_gain : 0;
 }
 
-/* What this drone lifts more than the other one to turn the stick. */
+/* Additional vertical acceleration of this drone that rotates the stick [m/s2]. */
 static float lift(const float *integral) {
     float side = MJXBALL_FOLLOWER ? -mjxball_rig.lift_sign : mjxball_rig.lift_sign;
     return side * mjxball_rig.tilt_gain * integral[3];
 }
 
-/* One period of this drone's law toward `goal`: `app->command`. False if the network had none. */
-static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
+/* One period of this drone's controller: sets `app->command`. False if the network's output is not finite. */
+static bool compute_command(mjxball_app *app, const pair_state *pair, const float *goal) {
     const float period = (float)mjxball_rig.period / 1000;
     float error[3], rate[3], base[3], *command = app->command, *integral = app->integral;
     bool good = true;
-    leader_error(one, goal, error, rate);
+    leader_error(pair, goal, error, rate);
     if (MJXBALL_FOLLOWER)
         for (int i = 0; i < 4; i++) integral[i] = app->peer.integral[i];
     pid(error, rate, integral, base);
 #if MJXBALL_FOLLOWER
     {
         float observation[18], more[3], integrated[3];
-        observe(one, goal, observation);
+        observe(pair, goal, observation);
 #ifdef MJXBALL_MOUNT_ANGLE
         turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
 #endif
@@ -223,10 +223,11 @@ static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
 #else
     for (int i = 0; i < 3; i++) command[i] = base[i];
     if (mjxball_rig.shares) {
-        float most = most_turn();
+        float most = tilt_integral_limit();
         command[2] += lift(integral);
         clip_command(command);
-        integral[3] = clip(integral[3] + period * (base[mjxball_rig.axis] - one->euler[mjxball_rig.axis]), -most, most);
+        integral[3] = clip(integral[3] + period * (base[mjxball_rig.axis] - pair->euler[mjxball_rig.axis]),
+            -most, most);
     }
     for (int i = 0; i < 3; i++) {
         float ahead = error[i] + mjxball_rig.lead * rate[i];

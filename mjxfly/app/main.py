@@ -16,7 +16,7 @@ from mjxfly.app.generate import check_place, write_app
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make the apps; return the exit code."""
+    """Write the apps; return the exit code."""
     about, place = (__doc__ or "").split("\n\n")
     parser = make_parser("python -m mjxfly.app", about, epilog=place)
     add_source(parser)
@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _make(options: argparse.Namespace) -> int:
-    """A policy for any rig is for the plant `crazyflie` by default."""
+    """Write the apps; a policy for any rig uses the plant `crazyflie` by default."""
     check_place(options.place)
     policy, name, plant = contents_of(options.source), options.source.stem, options.plant
     if plant is None and team.is_for_any(policy.card):

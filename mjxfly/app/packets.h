@@ -1,4 +1,4 @@
-/* What goes over radio: heartbeats, orders of the laptop, uploads of weights. Part of core.c. */
+/* Radio packets: heartbeats, requests of the laptop, uploads of weights. Part of core.c. */
 #ifndef MJXBALL_PACKETS_H
 #define MJXBALL_PACKETS_H
 
@@ -7,7 +7,7 @@
 #include "checks.h"
 #include "rig.h"
 
-/* Bytes, little-endian like every machine that this runs on. */
+/* Little-endian, the byte order of all supported machines. */
 
 static void copy(void *to, const void *from, unsigned size) {
     __builtin_memcpy(to, from, size);
@@ -35,7 +35,7 @@ void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now)
     copy(beat.integral, data + 8, 16);
     copy(beat.velocity, data + 24, 12);
     copy(&beat.apart, data + 36, 4);
-    if (!within(beat.integral, 3, MOST_INTEGRAL) || !within(beat.integral + 3, 1, most_turn())) return;
+    if (!within(beat.integral, 3, MOST_INTEGRAL) || !within(beat.integral + 3, 1, tilt_integral_limit())) return;
     if (!within(beat.velocity, 3, MOST_SPEED) || !within(&beat.apart, 1, APART)) return;
     app->peer = beat;
     app->peer_time = now ? now : 1;
@@ -59,7 +59,7 @@ static uint32_t word(const uint8_t *data) {
     return value;
 }
 
-/* The floats in front of the whole numbers are those of a policy file. */
+/* Whether the float parameters in front of the integer weights are finite and of plausible size. */
 static bool weights_are_good(const uint8_t *memory) {
     const float most = 1e6f;
     float value;
@@ -70,7 +70,7 @@ static bool weights_are_good(const uint8_t *memory) {
     return true;
 }
 
-/* What of an upload is wrong: begin (key, size, CRC), chunk (offset, bytes), or commit. */
+/* Handles a packet of an upload: begin (key, size, CRC), chunk (offset, bytes) or commit. Returns a cause. */
 static uint8_t take(mjxball_app *app, const uint8_t *data, int size, uint8_t *memory) {
     const uint8_t kind = data[0];
     if (app->phase != MJXBALL_IDLE) return MJXBALL_NOT_ON_GROUND;

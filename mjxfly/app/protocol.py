@@ -1,4 +1,4 @@
-"""What laptop and apps say to each other: phases, causes, packets of the app channel, parameters and log variables."""
+"""Interface of laptop and apps: phases, causes, packets of the app channel, parameters and log variables."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ PORT, CHANNEL = 13, 2  # the firmware's channel for apps
 BEAT_SIZE, REPLY_SIZE = 40, 8
 CHUNK = 24  # bytes of weights in a packet
 GROUP = "mjxb"
-CONTROLLER, PID, OUT_OF_TREE = "stabilizer.controller", 1, 6  # the firmware hands an app the state as the last alone
-# Names behind the group, with their types, in the order of glue.c; read-only ones are marked.
+CONTROLLER, PID, OUT_OF_TREE = "stabilizer.controller", 1, 6  # only an out-of-tree controller is given the state
+# Name without the group, type, whether read-only; in the order of glue.c.
 PARAMETERS = (
     *((f"{what}{axis}", "float", False) for what in ("goal", "mount") for axis in "XYZ"),
     ("curve", "uint8_t", False),
@@ -33,7 +33,7 @@ LOGGED = (
 
 
 class Phase(enum.IntEnum):
-    """`mjxball_phase`: where an app is, and what the laptop asks it for."""
+    """`mjxball_phase`: the state of an app, or the state that the laptop requests."""
 
     IDLE = 0
     SPIN = 1
@@ -45,7 +45,7 @@ class Phase(enum.IntEnum):
 
 
 CANNOT_FLY = "the firmware cannot fly"
-# The sentence of every `mjxball_cause`, in its order.
+# A sentence for every `mjxball_cause`, in the same order.
 CAUSES = (
     "good",
     "asked for by the laptop",
@@ -63,7 +63,7 @@ CAUSES = (
     "tilted beyond the limit",
     CANNOT_FLY,
     "thrust at its bound for too long",
-    "the law comes late",
+    "the controller is late",
     "the phase lasted too long",
     "on the ground",
     "weights refused: wrong rate, plant, layers, size or CRC",
@@ -74,37 +74,36 @@ CAUSES = (
 
 
 def reason(cause: int) -> str:
-    """The sentence of a cause."""
+    """Return the sentence of a `mjxball_cause`."""
     return CAUSES[cause] if 0 <= cause < len(CAUSES) else "unknown"
 
 
 class AppSample(NamedTuple):
-    """What an app logs about itself, as it arrived."""
+    """A log packet of an app."""
 
     phase: Phase
     cause: int
     refusal: int
     copying: bool
-    arrival: float  # [s] of our monotonic clock
+    arrival: float  # [s] of the laptop's monotonic clock
 
 
 APP_VARIABLES = tuple((f"{GROUP}.{name}", "uint8_t") for name in ("phase", "cause", "refusal", "copying"))
 
 
 def sample_of(values: Mapping[str, float], arrival: float) -> AppSample | None:
-    """An app's log packet by name; None for a phase that there is not."""
+    """Return the sample for the log variables `values` by name; None for an unknown phase."""
     phase, cause, refusal, copying = (int(values[name]) for name, _ in APP_VARIABLES)
-    known = phase <= max(Phase)
-    return AppSample(Phase(phase), cause, refusal, bool(copying), arrival) if known else None
+    return AppSample(Phase(phase), cause, refusal, bool(copying), arrival) if phase <= max(Phase) else None
 
 
 def order(phase: Phase) -> Packet:
-    """The laptop's heartbeat: which phase it wants."""
+    """Return the laptop's heartbeat, which requests `phase`."""
     return Packet(PORT, CHANNEL, bytes([1, phase]))
 
 
 def upload(weights: bytes, key: int) -> Iterator[Packet]:
-    """Packets that put `weights` into a follower that has everything else in common; each is answered."""
+    """Yield the packets that upload `weights` to a follower with the compatibility `key`; each is answered."""
     yield Packet(PORT, CHANNEL, struct.pack("<BIII", 2, key, len(weights), zlib.crc32(weights)))
     for at in range(0, len(weights), CHUNK):
         yield Packet(PORT, CHANNEL, struct.pack("<BI", 3, at) + weights[at : at + CHUNK])
@@ -120,5 +119,5 @@ class Reply(NamedTuple):
 
 
 def reply_of(data: bytes) -> Reply | None:
-    """The reply in the payload of a packet of the app channel; None if it is none."""
+    """Decode the payload of a packet of the app channel; None if it is not a reply."""
     return Reply(*struct.unpack("<BBxxI", data)) if len(data) == REPLY_SIZE else None

@@ -1,1 +1,1 @@
-"""The rig on the bench: gains for two drones that turn one body, and a plant file from a log of its flight."""
+"""Design of a rig: feasibility and loads, gains of the coupled attitude loops, identification from flight logs."""

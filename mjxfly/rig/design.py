@@ -1,4 +1,4 @@
-"""Command line of `python -m mjxfly.rig.design`: whether a rig can fly, what load it balances, and its plan."""
+"""Command line of `python -m mjxfly.rig.design`: whether a rig can fly, which loads it balances, a plan view."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from mjxball.files import write_whole
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.terminal import say
 
-WAYS = tuple((math.cos(turn * math.pi / 6), math.sin(turn * math.pi / 6)) for turn in range(6))  # and their opposites
-SHARES = (0.25, 0.5, 1.0)  # of the way to the object's end, at which the heaviest load is shown
+# Unit vectors 30 degrees apart; the opposite directions are covered because `largest_amplitude` tests both signs.
+DIRECTIONS = tuple((math.cos(turn * math.pi / 6), math.sin(turn * math.pi / 6)) for turn in range(6))
+SHARES = (0.25, 0.5, 1.0)  # CG offsets at which the heaviest load is reported, as fractions of `cg_limit`
 
 
 def parser() -> cli.Parser:
-    """The flags."""
+    """Return the argument parser."""
     result = cli.make_parser("python -m mjxfly.rig.design", "Say whether a rig can fly and what load it balances.")
     about = "shipped plant, file of a rig, or a model of a drone, MJCF or URDF (pair)"
     result.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
@@ -30,7 +31,7 @@ def parser() -> cli.Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compute, print, draw; return the exit code, 1 for a rig that does not balance its own object."""
+    """Print the report and write the plan; return the exit code, 1 if the rig cannot balance its own object."""
     options = parser().parse_args(arguments)
     return cli.run_command(lambda: _design(options))
 
@@ -53,18 +54,19 @@ def _design(options: argparse.Namespace) -> int:
 
 
 def balanced(settings: Config) -> float:
-    """How far from O the CG of the rig's own object may rest [m], on the object; negative: not even at O.
+    """Return the largest CG offset from O [m] at which the rig trims its own object, at most `cg_limit`.
 
-    In the plane the least of twelve directions.
+    It is negative if the rig cannot trim the object even at O. If the CG moves in the plane, it is the minimum over
+    twelve directions.
     """
     plant, margin = settings.plant, settings.scenario.trim_margin
-    ways = WAYS if len(plant.directions) == 2 else (None,)
-    held = (largest_amplitude(settings, plant.object_mass, margin, way) for way in ways)
-    return min(*held, cg_limit(plant))
+    directions = DIRECTIONS if len(plant.directions) == 2 else (None,)
+    amplitudes = (largest_amplitude(settings, plant.object_mass, margin, direction) for direction in directions)
+    return min(*amplitudes, cg_limit(plant))
 
 
 def report(settings: Config, held: float) -> list[str]:
-    """Lines for a person: weight and thrust, how far from O the rig's own object rests, heavier ones."""
+    """Return the report's lines: mass, hover thrust, CG limit `held` [m] of the rig's object, heaviest loads."""
     plant, limit = settings.plant, cg_limit(settings.plant)
     load, share = f"its object of {plant.object_mass:.3g} kg", 1 / thrust_over_weight(plant)
     can = f"can fly and balances {load} up to {held:.3g} m" if held >= 0 else f"cannot balance {load} even at 0 m"
@@ -78,7 +80,7 @@ def report(settings: Config, held: float) -> list[str]:
 
 
 def picture(settings: Config, held: float) -> str:
-    """The rig from above as SVG, x to the right, with the places where the CG of its object may rest."""
+    """Return the plan view as SVG, x to the right, with the region of the object's CG that the rig can trim."""
     plant = settings.plant
     mounts = [drone.mount for drone in plant.drones]
     far = tuple(max(held, 0.0) if axis in plant.directions else 0.0 for axis in (0, 1))

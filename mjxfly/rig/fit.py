@@ -1,6 +1,6 @@
-"""Identification of the pair: its roll and climb over windows of a log fitted by least squares, all windows at once.
+"""Identification of the pair: Gauss-Newton least squares on roll, roll rate and climb over windows of a log (ours).
 
-What is estimated is common to the windows; each has its own initial state and unmeasured moment and force.
+`RigParameters` are common to all windows. Every window has its initial state and an unmeasured moment and force.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from mjxfly.rig.log import Log
 Array = np.ndarray
 WINDOW = 1.0  # [s]
 FEWEST_WINDOWS, MOST_WINDOWS = 5, 40
-NOISE = np.array([0.005, 0.02, 0.02])  # of roll [rad], its rate [rad/s], climb [m/s]
-LOWEST_THRUST = 15000.0  # of both drones in a window that counts
-ROUNDS, STEPS = 3, 4
-# Logarithms of thrust, inertia, lag and of how uneven the thrust is, then the delay [s]; steps of differences, which
-# must be small where two unknowns nearly do the same; prior widths; largest change.
+NOISE = np.array([0.005, 0.02, 0.02])  # assumed measurement noise: roll [rad], roll rate [rad/s], climb [m/s]
+LOWEST_THRUST = 15000.0  # [thrust units] a usable window keeps both drones above it
+ROUNDS, STEPS = 3, 4  # replays of the log; Gauss-Newton steps after each
+# The common unknowns: log thrust, log inertia, log lag, log unevenness, delay [s]. Steps of the difference quotients
+# (small where the effects of two unknowns are nearly collinear), prior standard deviations, largest change in one step.
 DIFFERENCE = np.array([0.001, 0.002, 0.005, 0.001, 0.0004])
 PRIOR = np.array([0.3, 0.7, 0.7, 0.05, 0.02])
-LARGEST = np.array([0.2, 0.4, 0.4, 0.05, 0.01])
+LARGEST_CHANGE = np.array([0.2, 0.4, 0.4, 0.05, 0.01])
 START_DIFFERENCE = np.array([0.0005, 0.002, 0.002, 0.02, 0.04, 0.08, 0.002])
-COMMON, OWN = len(DIFFERENCE), len(START_DIFFERENCE)
+COMMON, PER_WINDOW = len(DIFFERENCE), len(START_DIFFERENCE)  # numbers of unknowns
 UNKNOWN_LIFT = 0.1  # [m/s2] standard deviation of `WindowStart.lift` from window to window
 SHORTEST_LAG, LONGEST_DELAY = 0.005, 0.06  # [s]
 
 
 class RigParameters(NamedTuple):
-    """What is identified; each (n,)."""
+    """The identified parameters, n candidates at once; each (n,)."""
 
     thrust: Array  # factor on the force of every motor
-    inertia: Array  # about the axis across the stick [kg m2]
-    lag: Array  # of the motors [s]
-    uneven: Array  # logarithm of the leader's force over what both drones' mean factor gives; minus the follower's
-    delay: Array  # from sending a setpoint to its part in what the state shows, without the motors' lag [s]
+    inertia: Array  # roll inertia about O [kg m2]
+    lag: Array  # motors' time constant [s]
+    uneven: Array  # log of the leader's force factor over `thrust`; the follower's is the negative
+    delay: Array  # from sending a setpoint to its effect in the logged state, without the motors' lag [s]
 
     @property
     def factors(self) -> Array:
@@ -53,33 +53,33 @@ class RigParameters(NamedTuple):
 
 
 class WindowStart(NamedTuple):
-    """How a window begins, and the moment and the force in it that nobody measured; each (n,)."""
+    """Initial state of a window, and its unmeasured moment and force; each (n,)."""
 
     roll: Array  # [rad]
     rate: Array  # [rad/s]
     climb: Array  # [m/s]
-    turning: Array  # angular acceleration by the ball and what else is not modelled, at the start [rad/s2]
-    growing: Array  # its change with time [rad/s3]
-    bending: Array  # half its second derivative [rad/s4]
-    lift: Array  # vertical acceleration by what is not modelled, such as the battery's charge [m/s2]
+    turning: Array  # unmodelled angular acceleration, such as that of the ball's moment, at the start [rad/s2]
+    growing: Array  # its first time derivative [rad/s3]
+    bending: Array  # half its second time derivative [rad/s4]
+    lift: Array  # unmodelled vertical acceleration, such as that of the battery's charge [m/s2]
 
 
 class CascadeHistory(NamedTuple):
-    """What the loops and motors of the log went through, on all of its ticks."""
+    """Cascade states and motor forces of both drones at the K ticks of the log."""
 
     loops: Array  # (K, 2, 13)
-    force: Array  # (K, 2, 4) of motors on the motor curve itself [N]
+    force: Array  # (K, 2, 4) by the nominal motor curve [N]
 
 
 class MotorModel(NamedTuple):
-    """From what a cascade mixes to the motors' steady force."""
+    """Map from the cascade's mixed thrust commands to the motors' steady force."""
 
-    compensate: Callable[[Array], Array] | None  # as for `crazyflie.cascade`
-    force: Callable[[Array], Array]  # [N] of what the cascade returns
+    compensate: Callable[[Array], Array] | None  # battery compensation, an argument of `crazyflie.cascade`
+    force: Callable[[Array], Array]  # [N] as a function of the cascade's output
 
 
 def motor_model(config: Config, log: Log) -> MotorModel:
-    """That of the firmware that flew. One that compensates for the battery reaches full power at its voltage only."""
+    """Return the motor model of the firmware that flew; battery compensation uses `log.volts` or a usual voltage."""
     curve, motor = config.autopilot.motor_curve, motor_of(config)
     if curve[0] > 0:
         return MotorModel(None, lambda command: crazyflie.motor_force(curve, command))
@@ -92,27 +92,27 @@ def motor_model(config: Config, log: Log) -> MotorModel:
 
 
 def replay(config: Config, log: Log, parameters: RigParameters) -> CascadeHistory:
-    """Run both drones' cascades and motors through the log's own measurements, on one plant, `parameters` each (1,)."""
-    law, motor = config.autopilot, motor_model(config, log)
+    """Run both drones' cascades and motors on the logged attitude, rates and setpoints, with one candidate (n = 1)."""
+    autopilot, motor = config.autopilot, motor_model(config, log)
     both = np.stack([log.euler] * 2, axis=1), np.stack([log.rates] * 2, axis=1)
     loops = crazyflie.start_loops(both[0][0], both[1][0])
     lag, late = parameters.lag[0], round(float(parameters.delay[0]) / crazyflie.PERIOD)
-    force = np.stack([crazyflie.motor_force(law.motor_curve, log.setpoints[0, :, 3])] * 4, axis=-1)
+    force = np.stack([crazyflie.motor_force(autopilot.motor_curve, log.setpoints[0, :, 3])] * 4, axis=-1)
     keep = math.exp(-crazyflie.PERIOD / lag)
-    shares = crazyflie.integral_shares(np, law, float)
-    kept_loops, kept_force = [], []
+    shares = crazyflie.integral_shares(np, autopilot, float)
+    loops_history, force_history = [], []
     for tick in range(len(log.euler)):
-        kept_loops.append(loops)
-        kept_force.append(force)
+        loops_history.append(loops)
+        force_history.append(force)
         sent = log.setpoints[max(tick - late, 0)]
-        seen = both[0][tick], both[1][tick]
-        loops, turned = crazyflie.cascade(law, loops, sent, *seen, shares, motor.compensate)
-        target = motor.force(turned)
+        measured = both[0][tick], both[1][tick]
+        loops, command = crazyflie.cascade(autopilot, loops, sent, *measured, shares, motor.compensate)
+        target = motor.force(command)
         force = target + keep * (force - target)
-    return CascadeHistory(np.stack(kept_loops), np.stack(kept_force))
+    return CascadeHistory(np.stack(loops_history), np.stack(force_history))
 
 
-def fly_windows(
+def simulate_windows(
     config: Config,
     log: Log,
     history: CascadeHistory,
@@ -121,32 +121,32 @@ def fly_windows(
     parameters: RigParameters,
     start: WindowStart,
 ) -> Array:
-    """Roll, roll rate, climb (ticks / every, n, 3) of n windows that begin at ticks `begins` (n,).
+    """Simulate n windows of `ticks` ticks that begin at ticks `begins` (n,).
 
-    Pitch and yaw are the log's.
+    Returns roll [rad], roll rate [rad/s], climb [m/s] (ticks / log.every, n, 3). Pitch and yaw are the log's.
     """
-    law, plant, h, motor = config.autopilot, config.plant, crazyflie.PERIOD, motor_model(config, log)
+    autopilot, plant, h, motor = config.autopilot, config.plant, crazyflie.PERIOD, motor_model(config, log)
     mass, lever = pair_mass(config), np.array([drone.mount[1] for drone in plant.pair])
     keep = np.exp(-h / parameters.lag)[:, None, None]
-    shares = crazyflie.integral_shares(np, law, float)
+    shares = crazyflie.integral_shares(np, autopilot, float)
     mean = (parameters.lag[:, None, None] / h) * (1 - keep)
     roll, rate, climb = start.roll, start.rate, start.climb
-    loops, force = _begin(log, history, begins, roll, rate)
-    # What uneven thrust does at the start is part of `turning`, or the two could hardly be told apart.
+    loops, force = _initial_loops(log, history, begins, roll, rate)
+    # The initial moment of uneven thrust belongs to `turning`: the fit could hardly separate the two.
     excess = (parameters.factors - parameters.thrust[:, None, None]) * force
-    known = (excess.sum(axis=-1) * lever).sum(axis=1)
+    offset = (excess.sum(axis=-1) * lever).sum(axis=1)
     force = parameters.factors * force
-    flown = []
+    simulated = []
     for tick in range(ticks):
         if tick % log.every == 0:
-            flown.append(np.stack([roll, rate, climb], axis=-1))
+            simulated.append(np.stack([roll, rate, climb], axis=-1))
         now = begins + tick
         euler, rates = log.euler[now].copy(), log.rates[now].copy()
         euler[:, 0], rates[:, 0] = roll, rate
         sent = _delayed(log.setpoints, now, parameters.delay / h)
-        seen = [np.stack([v, v], axis=1) for v in (euler, rates)]
-        loops, turned = crazyflie.cascade(law, loops, sent, seen[0], seen[1], shares, motor.compensate)
-        target = parameters.factors * motor.force(turned)
+        measured = [np.stack([v, v], axis=1) for v in (euler, rates)]
+        loops, command = crazyflie.cascade(autopilot, loops, sent, measured[0], measured[1], shares, motor.compensate)
+        target = parameters.factors * motor.force(command)
         acting = target + mean * (force - target)
         force = target + keep * (force - target)
         wrench = mixer.wrench_from_rotors(acting, plant.arm, plant.yaw_per_thrust, plant.layout)
@@ -154,19 +154,19 @@ def fly_windows(
         level = np.cos(roll) * np.cos(euler[:, 1])
         climb = climb + h * (wrench[..., 0].sum(axis=1) * level / mass - plant.gravity + start.lift)
         unknown = start.turning + (start.growing + start.bending * (tick * h)) * (tick * h)
-        rate = rate + h * ((torque - known) / parameters.inertia + unknown)
+        rate = rate + h * ((torque - offset) / parameters.inertia + unknown)
         roll = roll + h * rate
-    return np.stack(flown)
+    return np.stack(simulated)
 
 
 def pair_mass(config: Config) -> float:
-    """All that flies [kg]."""
+    """Mass of both drones and the object [kg]."""
     constants = plant_parameters(config.plant, config.attitude)
     return float(constants.drone_mass.sum()) + config.plant.object_mass
 
 
-def _begin(log: Log, history: CascadeHistory, begins: Array, roll: Array, rate: Array) -> tuple[Array, Array]:
-    """(loops, forces) of the windows' first ticks; what was last measured is where the window starts."""
+def _initial_loops(log: Log, history: CascadeHistory, begins: Array, roll: Array, rate: Array) -> tuple[Array, Array]:
+    """Cascade states (n, 2, 13), last measurement replaced by `roll`, `rate` (n,); motor forces (n, 2, 4) [N]."""
     euler, rates = log.euler[begins].copy(), log.rates[begins].copy()
     euler[:, 0], rates[:, 0] = roll, rate
     measured = np.concatenate([crazyflie.to_firmware(euler), crazyflie.to_firmware(rates)], axis=-1)
@@ -176,7 +176,7 @@ def _begin(log: Log, history: CascadeHistory, begins: Array, roll: Array, rate: 
 
 
 def _delayed(setpoints: Array, now: Array, ticks: Array) -> Array:
-    """Setpoints (n, 2, 4) as they were `ticks` (n,) before `now` (n,), between two ticks the mean by share."""
+    """Setpoints (n, 2, 4) `ticks` (n,) before `now` (n,), interpolated linearly between two ticks."""
     when = np.maximum(now - ticks, 0.0)
     low = np.floor(when).astype(int)
     share = (when - low)[:, None, None]
@@ -184,30 +184,30 @@ def _delayed(setpoints: Array, now: Array, ticks: Array) -> Array:
 
 
 class Estimate(NamedTuple):
-    """What was identified, with one standard deviation of each by the fit's own account."""
+    """Identified parameters with the standard deviations that the fit estimates."""
 
     thrust: float  # factor on the force of every motor
     inertia: float  # [kg m2]
     lag: float  # [s]
     delay: float  # [s]
-    spread: tuple[float, float, float, float]  # of thrust, inertia, lag (shares) and delay [s]
-    misfit: float  # root mean square of what is left, in units of the assumed noise
+    spread: tuple[float, float, float, float]  # standard deviations of thrust, inertia, lag (relative) and delay [s]
+    misfit: float  # root mean square of the residuals, in units of the assumed noise
     windows: int
-    uneven: float = 0.0  # share by which the leader's force is above, and the follower's below, the factor `thrust`
-    uneven_spread: float = 1.0
+    uneven: float = 0.0  # log of the leader's force factor over `thrust`; the follower's is the negative
+    uneven_spread: float = 1.0  # standard deviation of `uneven`
 
 
 def identify(config: Config, log: Log) -> Estimate:
-    """Fit the plant of `config` to `log`. Raises InputError if there is too little of it."""
+    """Fit the plant of `config` to `log`. Raises InputError for fewer than `FEWEST_WINDOWS` usable windows."""
     begins, ticks = _windows(log)
     nominal = np.array([0.0, np.log(inertia_about_o(config)[0]), np.log(config.plant.rotor_lag), 0.0, 0.01])
-    common, own = nominal.copy(), _starts(log, begins)
-    left = spread = np.zeros(COMMON)
+    common, starts = nominal.copy(), _starts(log, begins)
+    residuals = spread = np.zeros(COMMON)
     for _ in range(ROUNDS):
         history = replay(config, log, _parameters(common[None]))
         for _ in range(STEPS):
-            common, own, left, spread = _step(config, log, history, begins, ticks, common, own, nominal)
-    misfit = float(np.sqrt(np.mean(left**2)))
+            common, starts, residuals, spread = _step(config, log, history, begins, ticks, common, starts, nominal)
+    misfit = float(np.sqrt(np.mean(residuals**2)))
     spread = spread * max(misfit, 1.0)
     thrust, inertia, lag = map(float, np.exp(common[:3]))
     uneven, delay = map(float, common[3:])
@@ -216,7 +216,7 @@ def identify(config: Config, log: Log) -> Estimate:
 
 
 def _windows(log: Log) -> tuple[Array, int]:
-    """(n,) ticks at which windows begin, one after the other wherever the log can be used, and their length."""
+    """Return the first ticks (n,) of consecutive windows over the usable parts of the log, and their length [ticks]."""
     ticks, begins = round(WINDOW / PERIOD), []
     usable = log.usable & (log.setpoints[..., 3].min(axis=1) > LOWEST_THRUST)
     unusable = np.append(np.flatnonzero(~usable), len(usable))
@@ -240,10 +240,10 @@ def _windows(log: Log) -> tuple[Array, int]:
 
 
 def _starts(log: Log, begins: Array) -> Array:
-    """(n, OWN) first guesses of `WindowStart`."""
-    found = np.zeros((len(begins), OWN))
-    found[:, 0], found[:, 1], found[:, 2] = log.euler[begins, 0], log.rates[begins, 0], log.climb[begins]
-    return found
+    """Initial guesses of `WindowStart`, (n, PER_WINDOW): the measured state, no unknown moment or force."""
+    guess = np.zeros((len(begins), PER_WINDOW))
+    guess[:, 0], guess[:, 1], guess[:, 2] = log.euler[begins, 0], log.rates[begins, 0], log.climb[begins]
+    return guess
 
 
 def _parameters(common: Array) -> RigParameters:
@@ -259,51 +259,52 @@ def _step(
     begins: Array,
     ticks: int,
     common: Array,
-    own: Array,
+    starts: Array,
     nominal: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """One Gauss-Newton step: (common, own, residuals before it, standard deviations of `common`).
+    """One Gauss-Newton step: (common, starts, residuals before it, standard deviations of `common`).
 
-    The windows' own unknowns are eliminated.
+    The unknowns of single windows are eliminated from the normal equations (Schur complement).
     """
-    left, slopes = _slopes(config, log, history, begins, ticks, common, own)
-    lifts = np.zeros(COMMON + OWN)
+    residuals, jacobian = _linearize(config, log, history, begins, ticks, common, starts)
+    lifts = np.zeros(COMMON + PER_WINDOW)
     lifts[-1] = 1 / UNKNOWN_LIFT
     normal, right = np.diag(1 / PRIOR**2), (nominal - common) / PRIOR**2
     eliminated = []
-    for window, mine in enumerate(own):
-        known = np.vstack([slopes[:, window].T, lifts])
-        rest = np.append(left[window], -mine[-1] / UNKNOWN_LIFT)
+    for window, start in enumerate(starts):
+        known = np.vstack([jacobian[:, window].T, lifts])
+        rest = np.append(residuals[window], -start[-1] / UNKNOWN_LIFT)
         a, b = known[:, :COMMON], known[:, COMMON:]
         inverse = np.linalg.pinv(b)
         eliminated.append((inverse, a, rest))
         across = a - b @ (inverse @ a)
         normal = normal + across.T @ across
         right = right + across.T @ rest
-    change = np.clip(np.linalg.solve(normal, right), -LARGEST, LARGEST)
+    change = np.clip(np.linalg.solve(normal, right), -LARGEST_CHANGE, LARGEST_CHANGE)
     moved = np.stack([inverse @ (rest - a @ change) for inverse, a, rest in eliminated])
     after = common + change
     after[-1] = np.clip(after[-1], 0.0, LONGEST_DELAY)
-    return after, own + moved, left, np.sqrt(np.diag(np.linalg.inv(normal)))
+    return after, starts + moved, residuals, np.sqrt(np.diag(np.linalg.inv(normal)))
 
 
-def _slopes(
-    config: Config, log: Log, history: CascadeHistory, begins: Array, ticks: int, common: Array, own: Array
+def _linearize(
+    config: Config, log: Log, history: CascadeHistory, begins: Array, ticks: int, common: Array, starts: Array
 ) -> tuple[Array, Array]:
-    """Residuals (n, rows) and the slopes (COMMON + OWN, n, rows) of what is flown, both in units of `NOISE`.
+    """Residuals (n, rows) and Jacobian (COMMON + PER_WINDOW, n, rows) of the simulation, in units of `NOISE`.
 
-    All difference quotients of all windows are flown together.
+    The Jacobian's forward differences of all windows are simulated as one batch.
     """
-    count, width = len(begins), 1 + COMMON + OWN
-    commons = np.broadcast_to(common, (width, COMMON)).copy()
-    commons[1 : 1 + COMMON] += np.diag(DIFFERENCE)
-    owns = np.broadcast_to(own, (width, count, OWN)).copy()
-    owns[1 + COMMON :] += np.diag(START_DIFFERENCE)[:, None, :]
-    parameters, start = _parameters(np.repeat(commons, count, axis=0)), WindowStart(*owns.reshape(-1, OWN).T)
-    flown = fly_windows(config, log, history, np.tile(begins, width), ticks, parameters, start)
-    flown = flown.reshape(len(flown), width, count, 3).transpose(1, 2, 0, 3)  # (width, n, rows, 3)
+    count, width = len(begins), 1 + COMMON + PER_WINDOW
+    all_common = np.broadcast_to(common, (width, COMMON)).copy()
+    all_common[1 : 1 + COMMON] += np.diag(DIFFERENCE)
+    all_starts = np.broadcast_to(starts, (width, count, PER_WINDOW)).copy()
+    all_starts[1 + COMMON :] += np.diag(START_DIFFERENCE)[:, None, :]
+    parameters = _parameters(np.repeat(all_common, count, axis=0))
+    start = WindowStart(*all_starts.reshape(-1, PER_WINDOW).T)
+    simulated = simulate_windows(config, log, history, np.tile(begins, width), ticks, parameters, start)
+    simulated = simulated.reshape(len(simulated), width, count, 3).transpose(1, 2, 0, 3)  # (width, n, rows, 3)
     when = begins[:, None] + np.arange(0, ticks, log.every)
-    seen = np.stack([log.euler[when, 0], log.rates[when, 0], log.climb[when]], axis=-1)
-    slopes = ((flown[1:] - flown[0]) / NOISE).reshape(width - 1, count, -1)
-    slopes /= np.concatenate([DIFFERENCE, START_DIFFERENCE])[:, None, None]
-    return ((seen - flown[0]) / NOISE).reshape(count, -1), slopes
+    measured = np.stack([log.euler[when, 0], log.rates[when, 0], log.climb[when]], axis=-1)
+    jacobian = ((simulated[1:] - simulated[0]) / NOISE).reshape(width - 1, count, -1)
+    jacobian /= np.concatenate([DIFFERENCE, START_DIFFERENCE])[:, None, None]
+    return ((measured - simulated[0]) / NOISE).reshape(count, -1), jacobian

@@ -1,4 +1,4 @@
-"""Command line of `python -m mjxfly.rig.gains`: attitude and rate gains for two Crazyflies on one stick."""
+"""Command line of `python -m mjxfly.rig.gains`: attitude and rate gains of two Crazyflies on one stick."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PRESETS = ("flight", "stand")
 
 
 def parser() -> cli.Parser:
-    """The flags."""
+    """Return the argument parser."""
     result = cli.make_parser("python -m mjxfly.rig.gains", "Compute gains for the coupled pair, with their margins.")
     result.add_argument("--preset", choices=PRESETS, default="flight", help="rig (default flight)")
     result.add_argument(
@@ -38,7 +38,7 @@ def parser() -> cli.Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compute, print, write; return the exit code."""
+    """Design the gains, print them with their margins, write the file; return the exit code."""
     options = parser().parse_args(arguments)
     return cli.run_command(lambda: _gains(options))
 
@@ -59,12 +59,12 @@ def _gains(options: argparse.Namespace) -> int:
 
 
 def parameter_file(autopilot: config.Autopilot) -> str:
-    """JSON of both drones' firmware parameters, as `mjxfly --gains` reads it."""
+    """Return both drones' firmware parameters as JSON, the file that `mjxfly --gains` reads."""
     return json.dumps(gains_to_json(pair_gains(autopilot)), indent=1) + "\n"
 
 
 def report(designs: Sequence[Design], lag: float) -> str:
-    """A table: for each axis the designed gains and the delivered ones, with nominal and worst margins."""
+    """Return a table: per axis the designed and the delivered gains, with nominal and worst margins; `lag` in [s]."""
     head = ("axis", "inertia", "gains", "attitude kp ki kd", "rate kp ki kd", "phase", "gain", "delay", "worst")
     rows: list[tuple[str, ...]] = [head]
     for one in designs:
@@ -89,14 +89,14 @@ def report(designs: Sequence[Design], lag: float) -> str:
     return "\n".join(lines)
 
 
-def _row(one: Design, whose: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
-    numbers = (" ".join(f"{value:g}" for value in row) for row in gains)
+def _row(one: Design, label: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
+    gain_texts = (" ".join(f"{value:g}" for value in row) for row in gains)
     inertia = f"{one.axis.inertia_ratio:.1f} x"
     if not nominal.phase:
-        return (one.axis.name, inertia, whose, *numbers, "unstable", "", "", "unstable")
+        return (one.axis.name, inertia, label, *gain_texts, "unstable", "", "", "unstable")
     gain = f"x {nominal.gain_up:.1f}, / {nominal.gain_down:.1f}"
     left = f"{worst.phase:.0f} deg, x {worst.gain_up:.1f}, / {worst.gain_down:.1f}" if worst.phase else "unstable"
-    return (one.axis.name, inertia, whose, *numbers, f"{nominal.phase:.0f} deg", gain, _ms(nominal.delay), left)
+    return (one.axis.name, inertia, label, *gain_texts, f"{nominal.phase:.0f} deg", gain, _ms(nominal.delay), left)
 
 
 def _ms(seconds: float) -> str:

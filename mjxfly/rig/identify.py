@@ -29,11 +29,11 @@ from mjxfly.rig.log import Log, read_log
 from mjxfly.setpoints import CurveName
 
 LEAST_INERTIA = 1e-6  # of a drone about its own centre [kg m2]
-DELAY_EITHER_WAY = 0.01  # [s] by which training varies the delay that was found
+DELAY_EITHER_WAY = 0.01  # [s] half width of the delay range in the plant file, which training samples
 
 
 def parser() -> cli.Parser:
-    """The flags."""
+    """Return the argument parser."""
     about = "Estimate hover thrust, thrust gain, motor lag, inertia across the stick and delay from logs."
     result = cli.make_parser("python -m mjxfly.rig.identify", about)
     result.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="of mjxfly --log, a bag, .npz; see docs")
@@ -47,7 +47,7 @@ def parser() -> cli.Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Identify, print, write; return the exit code."""
+    """Identify the plant, print the estimates, write the plant file; return the exit code."""
     options = parser().parse_args(arguments)
     return cli.run_command(lambda: _identify(options))
 
@@ -75,14 +75,14 @@ def _identify(options: argparse.Namespace) -> int:
     values = {**known, **conversion(settings, converted), **plant_settings(converted, mean)}
     if options.out:
         write_whole(options.out, json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
-    config.validate(config.apply_overrides(settings, values))  # the file is kept: what is wrong is the rig
+    config.validate(config.apply_overrides(settings, values))  # after writing: a rig too weak to fly keeps its file
     return 0
 
 
 def flown_with(settings: config.Config, log: Log, gains: PairGains | None, path: Path) -> config.Config:
-    """`settings` on the force curve that the `log` says was flown, with the `gains` given, else with the log's.
+    """Return `settings` with the log's force curve, and with `gains` or else the log's gains.
 
-    Raises InputError if the log is of a rig on another stand, or what flew cannot be identified with.
+    Raises InputError if the log is of another stand, or its curves or gains are not supported by the identification.
     """
     if log.stand not in (None, settings.plant.stand):
         rig = "flight" if log.stand == "free" else "stand"
@@ -101,14 +101,14 @@ def flown_with(settings: config.Config, log: Log, gains: PairGains | None, path:
 
 
 def curve_of_all(curves: Sequence[CurveName]) -> CurveName:
-    """The force curve of all logs. Raises InputError if they have different ones."""
+    """Return the common force curve of all logs. Raises InputError if they differ."""
     if len(set(curves)) > 1:
         raise InputError(f"the logs are of different force curves ({', '.join(curves)}): identify each curve by itself")
     return curves[0]
 
 
 def conversion(settings: config.Config, converted: config.Config) -> dict[str, Any]:
-    """Settings by path of the autopilot by which `converted`, on another force curve, differs from `settings`."""
+    """Return the autopilot's settings, by path, in which `converted` differs from `settings`."""
     pairs = {
         f"autopilot.{item.name}": (getattr(settings.autopilot, item.name), getattr(converted.autopilot, item.name))
         for item in dataclasses.fields(converted.autopilot)
@@ -121,27 +121,27 @@ def conversion(settings: config.Config, converted: config.Config) -> dict[str, A
 
 
 def with_gains(settings: config.Config, gains: PairGains) -> config.Config:
-    """`settings` whose autopilot has both drones' firmware parameters `gains`; others than its loops' are ignored.
+    """Return `settings` with both drones' loop gains taken from the firmware parameters `gains`.
 
-    Raises InputError if the follower's differ from the leader's by more than one factor on all ki.
+    Raises InputError if the follower's gains differ from the leader's by more than one common factor on all ki.
     """
-    law = settings.autopilot
+    autopilot = settings.autopilot
     leader, follower = (
         {**before, **{name: value for name, value in own.items() if name in PARAMETERS}}
-        for before, own in zip(pair_gains(law), gains, strict=True)
+        for before, own in zip(pair_gains(autopilot), gains, strict=True)
     )
     largest = max((name for name in leader if name.endswith("_ki")), key=lambda name: leader[name])
     share = follower[largest] / leader[largest] if leader[largest] else 1.0
     if not 0 <= share <= 1:
         raise InputError("identification takes a follower whose ki are not above the leader's")
-    law = dataclasses.replace(crazyflie.with_gains(law, leader), follower_ki_scale=share)
-    if not all(math.isclose(value, follower[name], rel_tol=1e-3) for name, value in pair_gains(law)[1].items()):
+    autopilot = dataclasses.replace(crazyflie.with_gains(autopilot, leader), follower_ki_scale=share)
+    if not all(math.isclose(value, follower[name], rel_tol=1e-3) for name, value in pair_gains(autopilot)[1].items()):
         raise InputError("identification takes a follower whose gains are the leader's, all ki by one factor less")
-    return dataclasses.replace(settings, autopilot=law)
+    return dataclasses.replace(settings, autopilot=autopilot)
 
 
 def average(found: Sequence[Estimate]) -> Estimate:
-    """One result from several logs, each weighted by its own precision."""
+    """Return the mean of several estimates, weighted by their inverse variances."""
     values = np.array([[one.thrust, one.inertia, one.lag, one.delay, one.uneven] for one in found])
     weights = 1 / np.array([[*one.spread, one.uneven_spread] for one in found]) ** 2
     thrust, inertia, lag, delay, uneven = map(float, (weights * values).sum(axis=0) / weights.sum(axis=0))
@@ -152,9 +152,9 @@ def average(found: Sequence[Estimate]) -> Estimate:
 
 
 def plant_settings(settings: config.Config, found: Estimate) -> dict[str, Any]:
-    """Settings by path that make `settings` the plant that was found.
+    """Return the settings, by path, that turn `settings` into the identified plant.
 
-    Inertia beyond what masses and places explain is given to the drones, half to each, about roll and yaw.
+    The inertia that masses and positions do not explain is added to the drones, half to each, about roll and yaw.
     """
     plant, (a, b) = settings.plant, settings.autopilot.motor_curve
     curve = (found.thrust * a, found.thrust * b)
@@ -172,7 +172,7 @@ def plant_settings(settings: config.Config, found: Estimate) -> dict[str, Any]:
             for number, drone in enumerate(plant.drones)
         },
         "autopilot.motor_curve": [_rounded(value) for value in curve],
-        # What takes more than there is is a rig that is too weak: `validate` says so.
+        # A rig too weak to hover is reported by `validate`.
         "autopilot.hover_thrust": min(round(hover(stronger)[0]), THRUST_CEILING),
         "scenario.delay": [
             _rounded(max(found.delay - DELAY_EITHER_WAY, 0.0)),
@@ -182,7 +182,7 @@ def plant_settings(settings: config.Config, found: Estimate) -> dict[str, Any]:
 
 
 def report(settings: config.Config, found: Estimate) -> str:
-    """What was found with one standard deviation by the fit's own account, a line each."""
+    """Return one line for each estimate with its standard deviation, and hints about a poor log."""
     a, b = settings.autopilot.motor_curve
     stronger = config.apply_overrides(settings, {"autopilot.motor_curve": (found.thrust * a, found.thrust * b)})
     command, slope = hover(stronger)

@@ -1,4 +1,4 @@
-"""Logs of a flight or a bench run, brought to one form: what both drones were sent and what they measured."""
+"""Logs of a flight or a bench run, resampled for identification: setpoints and measurements of both drones."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from mjxfly.log_consistency import UNEVEN, faults
 from mjxfly.recording import GUIDED, FlightLog, Outage, load, numbers, outages
 from mjxfly.setpoints import CurveName
 
-STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
-OFF_THE_GROUND = 0.03  # [m] above the start of a flight from which on nothing touches the pair
-STEPS = (5e-4, 0.2)  # [s] between two rows, as a rule: what is slower or faster is in another unit
-LONGEST_HOLD = 0.4  # [s] without a setpoint after which what the firmware does is not what is modelled
+STATE = 13  # columns of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
+OFF_THE_GROUND = 0.03  # [m] height above the start from which on there is no ground contact
+STEPS = (5e-4, 0.2)  # [s] plausible period of the rows; anything else has another unit of time
+LONGEST_HOLD = 0.4  # [s] oldest usable setpoint; the level-out of the firmware that follows is not modelled
 
 
 class Log(NamedTuple):
-    """A log on the ticks of the drones' loops, 2 ms apart; leader and follower on the axis of size 2."""
+    """A log resampled to the K ticks of the drones' loops, 2 ms apart; axis 1 of size 2 is leader, follower."""
 
-    setpoints: np.ndarray  # (K, 2, 4) roll, pitch [deg], yaw rate [deg/s], thrust, as on the wire, held
+    setpoints: np.ndarray  # (K, 2, 4) roll, pitch [deg], yaw rate [deg/s], thrust, as on the wire, zero-order hold
     climb: np.ndarray  # (K,) vertical velocity of O [m/s]
-    euler: np.ndarray  # (K, 3) of the body, the mean of both drones [rad]
-    rates: np.ndarray  # (K, 3) likewise [rad/s]
+    euler: np.ndarray  # (K, 3) attitude of the body, mean of both drones [rad]
+    rates: np.ndarray  # (K, 3) body rates, mean of both drones [rad/s]
     usable: np.ndarray  # (K,) True: guided flight, off the ground, and both drones' states are known
     every: int  # ticks between two measurements
-    remarks: tuple[str, ...] = ()  # what was left out, or should be known, a line each
-    stand: str | None = None  # of the rig that flew, as its log has it
-    gains: PairGains | None = None  # that were flown, likewise
-    curves: tuple[CurveName, CurveName] | None = None  # of leader's and follower's firmware, likewise
-    volts: float | None = None  # of the batteries under load, the median; None: not measured
+    remarks: tuple[str, ...] = ()  # warnings for the user, a line each
+    stand: str | None = None  # the following four are None if the log does not contain them
+    gains: PairGains | None = None
+    curves: tuple[CurveName, CurveName] | None = None  # force curves of leader and follower
+    volts: float | None = None  # median battery voltage under load
 
 
 def read_log(path: Path, assumed: Config | None = None) -> Log:
-    """A log of `mjxfly --log`, or an .npz of time (T,), setpoints (T, 2, 4), states (T, 2, 13).
+    """Read a log of `mjxfly --log`, or an .npz of time (T,), setpoints (T, 2, 4), states (T, 2, 13).
 
-    What another program logged is of the rig `assumed`, see `flight_log.read`. Raises InputError.
+    `assumed` is the configuration of a log that another program wrote, see `flight_log.read`. Raises InputError.
     """
     if path.suffix != ".npz":
         return _of_flight(load(path, assumed))
@@ -65,11 +65,11 @@ def make_log(
     states: Sequence[np.ndarray],
     guided: np.ndarray | None = None,
 ) -> Log:
-    """Bring setpoints (T, 2, 4) at `sent_at` and two drones' `states` (S, 13) at `seen_at` onto the ticks.
+    """Resample setpoints (T, 2, 4) at times `sent_at` and both drones' `states` (S, 13) at times `seen_at`.
 
-    `guided` (T,) says at which setpoints of a flight, which starts on the ground, the laws were in command; if it is
-    not given, they always were, in the air. Rows with numbers that are none are missing. Raises ValueError if the
-    arrays are unsound, or of clocks that differ.
+    `guided` (T,) says at which setpoints the controllers were in command of a flight that starts on the ground; None
+    means always, and in the air. Rows that are not finite are left out. Raises ValueError if shapes or values are wrong
+    or the clocks of setpoints and states differ.
     """
     times = [seen_at, seen_at] if isinstance(seen_at, np.ndarray) else list(seen_at)
     count = len(sent_at)
@@ -77,11 +77,11 @@ def make_log(
         raise ValueError("shapes do not fit: time (T,), setpoints (T, 2, 4), states (T, 2, 13)")
     if min(count, *map(len, times)) < 2:
         raise ValueError("it holds fewer than two rows")
-    kept, remarks = _kept((sent_at, *times), (setpoints, *states))
+    kept, remarks = _valid_rows((sent_at, *times), (setpoints, *states))
     sent_at, setpoints = sent_at[kept[0]], setpoints[kept[0]]
     guided = None if guided is None else guided[kept[0]]
-    times = [t[own] for t, own in zip(times, kept[1:], strict=True)]
-    states = [rows[own] for rows, own in zip(states, kept[1:], strict=True)]
+    times = [t[rows] for t, rows in zip(times, kept[1:], strict=True)]
+    states = [state[rows] for state, rows in zip(states, kept[1:], strict=True)]
     flown = slice(None) if guided is None else guided
     for fault in faults((sent_at[flown], setpoints[flown]), list(zip(times, states, strict=True))):
         raise ValueError(fault)
@@ -98,10 +98,10 @@ def make_log(
     return Log(setpoints[latest], climb, euler, rates, usable & ~_within(grid, found), every, remarks)
 
 
-def _kept(times: Sequence[np.ndarray], series: Sequence[np.ndarray]) -> tuple[list[np.ndarray], tuple[str, ...]]:
-    """Of setpoints and both drones' states the rows that are whole, in the order of time, and what is missing.
+def _valid_rows(times: Sequence[np.ndarray], series: Sequence[np.ndarray]) -> tuple[list[np.ndarray], tuple[str, ...]]:
+    """Return the indices of the valid rows of setpoints and both drones' states, and remarks on the others.
 
-    Raises ValueError if too little is left.
+    Valid rows are finite, increase in time, and have unit quaternions. Raises ValueError if fewer than two are left.
     """
     kept, remarks = [], []
     for name, time, rows in zip(("setpoints", *NAMES), times, series, strict=True):
@@ -123,6 +123,7 @@ def _kept(times: Sequence[np.ndarray], series: Sequence[np.ndarray]) -> tuple[li
 
 
 def _on_grid(grid: np.ndarray, time: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Climb (K,), Euler angles (K, 3) and body rates (K, 3) interpolated at the times `grid` (K,)."""
     quaternion = states[:, 6:10] / np.linalg.norm(states[:, 6:10], axis=1, keepdims=True)
     euler = np.unwrap(rotations.euler_from_matrix(rotations.matrix_from_quaternion(quaternion)), axis=0)
 
@@ -133,7 +134,7 @@ def _on_grid(grid: np.ndarray, time: np.ndarray, states: np.ndarray) -> tuple[np
 
 
 def _within(grid: np.ndarray, gaps: Sequence[Outage]) -> np.ndarray:
-    """(K,) whether each time lies in one of the `gaps`."""
+    """Return a mask (K,) of the times that lie in one of the `gaps`."""
     inside = np.zeros(len(grid), bool)
     for gap in gaps:
         inside |= (grid > gap.begin) & (grid < gap.end)
@@ -141,12 +142,12 @@ def _within(grid: np.ndarray, gaps: Sequence[Outage]) -> np.ndarray:
 
 
 def _of_flight(flown: FlightLog) -> Log:
-    """A flight from where its motors turn, since the integrals that it is flown with begin there."""
+    """Resample a flight from the start of its motors, where the integrals of the drones' loops begin."""
     ticks = [one for one in flown.records if one["kind"] == "tick"]
     own = [[one for one in flown.records if one["kind"] == "state" and one["drone"] == name] for name in NAMES]
     guided = np.array([one["state"] == GUIDED for one in ticks])
     if not guided.any():
-        raise InputError(f"flight log {flown.path} holds no guided flight: its laws were never in command")
+        raise InputError(f"flight log {flown.path} holds no guided flight: its controllers were never in command")
     try:
         log = make_log(
             np.array([one["t"] for one in ticks]),

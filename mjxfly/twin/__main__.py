@@ -1,6 +1,6 @@
-"""`python -m mjxfly.twin`: the twin as a process of its own. Prints its two URIs as one line of JSON.
+"""`python -m mjxfly.twin`: run the twin as a process. Prints its two URIs as one line of JSON.
 
-It ends when its standard input closes and its motors are off, so that it does not outlive the process that started it.
+It ends when standard input is closed and its motors are off, so that it does not outlive the process that started it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main() -> int:
     """Command line of the twin; returns the exit code."""
     parser = make_parser("python -m mjxfly.twin", __doc__ or "")
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
-    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
+    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its metadata define the rig")
     for name in ("loss", "delay", "jitter"):
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
     parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")
@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def serve(options: argparse.Namespace) -> int:
-    """Run the twin that `options` ask for until standard input ends."""
+    """Run the twin that `options` describe until standard input ends; return the exit code."""
     clock.slow_down(options.slow)
     policy = load_policy(options.policy) if options.policy else None
     card = policy.card if policy else None
@@ -62,7 +62,7 @@ def serve(options: argparse.Namespace) -> int:
             threading.Thread(target=inject_later, args=(twin, one, waiting), daemon=True).start()
         report(uris=twin.uris)
         with contextlib.suppress(KeyboardInterrupt):
-            attend(twin)
+            report_until_end(twin)
         weights = Rig.of_card(card).weights if card else (0.5, 0.5)
         place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
         found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
@@ -71,33 +71,33 @@ def serve(options: argparse.Namespace) -> int:
     return 0
 
 
-def attend(twin: Twin) -> None:
-    """Say how late the twin is, until standard input has ended and the motors are off, or the twin cannot keep up."""
-    left = math.inf  # when the runner left [s]
-    while twin.failure is None and clock.now() < left + LAST:
-        if math.isinf(left) and listen_on(sys.stdin.fileno(), BEAT):
-            left = clock.now()
-        if not math.isinf(left):
+def report_until_end(twin: Twin) -> None:
+    """Report the twin's delay until standard input has ended and the motors are off, or the twin cannot keep up."""
+    closed = math.inf  # when standard input ended [s]
+    while twin.failure is None and clock.now() < closed + LAST:
+        if math.isinf(closed) and is_closed(sys.stdin.fileno(), BEAT):
+            closed = clock.now()
+        if not math.isinf(closed):
             if not twin.turning:
                 return
             clock.sleep(BEAT)
         report(at=clock.now(), behind=twin.behind)
 
 
-def listen_on(pipe: int, seconds: float) -> bool:
-    """Whether `pipe` was closed within `seconds`; whatever comes over it is dropped."""
+def is_closed(pipe: int, seconds: float) -> bool:
+    """Wait for input on `pipe` for at most `seconds`; return whether it was closed. Input is dropped."""
     readable, _, _ = select.select([pipe], [], [], clock.real(seconds))
     return bool(readable) and not os.read(pipe, 4096)
 
 
 def report(**fields: Any) -> None:
-    """One line for the runner, which may be gone."""
+    """Print one line of JSON for the runner, which may have ended."""
     with contextlib.suppress(OSError):
         say(json.dumps(fields))
 
 
 def inject_later(twin: Twin, one: Injection, waiting: list[Injection]) -> None:
-    """Wait for the first motor to turn, then until the fault is due; it does not wait any more then."""
+    """Inject the fault `one.after` seconds after the first motor turns, and remove it from `waiting`."""
     while twin.truth.pwm.max() == 0 or max(twin.truth.thrust) == 0:
         clock.sleep(0.01)
     clock.sleep(one.after)

@@ -1,6 +1,6 @@
-"""The firmware's supervisor: whether motors may run, from what 25 times a second is true. No clock of its own.
+"""The firmware's supervisor: a state machine, updated 25 times a second, that decides whether motors may run.
 
-Written from the facts of bitcraze/crazyflie-firmware 2026.08. Times in seconds of the drone's clock.
+Behaviour of bitcraze/crazyflie-firmware 2026.08. Times are arguments, in seconds of the drone's clock.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from typing import NamedTuple
 from mjxfly import packets
 from mjxfly.twin.conditions import DroneKind
 
-PERIOD = 0.04  # [s] between two looks at the conditions
+PERIOD = 0.04  # [s] of updates
 FLYING_KEPT = 2.0  # [s] it counts as flying after a motor was last above idle
-LEVEL_AFTER, LOCK_AFTER = 0.5, 2.0  # [s] without a setpoint
-LANDED_TIME, PREFLIGHT_TIME = 3.0, 30.0  # [s] until it starts over: after landing, and armed on the ground
-KEEPALIVE_TIME = 1.0  # [s] a keepalive of the emergency stop that was begun must come again within it
-TILTED, TILTED_TIME = 0.5, 1.0  # acc.z [g] below which it is tilted, [s] it may be
-INVERTED, INVERTED_TIME = -0.2, 0.1  # likewise upside down
-FREE_FALL = 0.1  # [g] no axis of the accelerometer shows more in a fall
-TRAJECTORY_FINISHED = 0x200  # info bit of the high-level commander, which is never used here
+LEVEL_AFTER, LOCK_AFTER = 0.5, 2.0  # [s] without a setpoint until it levels out, until it locks
+LANDED_TIME, PREFLIGHT_TIME = 3.0, 30.0  # [s] until it resets after landing; until it disarms on the ground
+KEEPALIVE_TIME = 1.0  # [s] longest pause between keepalives of the emergency stop, once they have begun
+TILTED, TILTED_TIME = 0.5, 1.0  # tilted if acc.z [g] is lower; [s] until that counts as tumbled
+INVERTED, INVERTED_TIME = -0.2, 0.1  # the same for upside down
+FREE_FALL = 0.1  # [g] largest reading of every accelerometer axis in free fall
+TRAJECTORY_FINISHED = 0x200  # info bit of the high-level commander, which is not simulated
 
 
 class Phase(enum.Enum):
@@ -47,7 +47,7 @@ AIRBORNE = (Phase.FLYING, Phase.LEVEL_OUT)
 
 
 class Conditions(NamedTuple):
-    """What one look finds."""
+    """Conditions that one update finds; inputs of the transitions."""
 
     armed: bool
     flying: bool
@@ -61,7 +61,7 @@ class Conditions(NamedTuple):
 
 
 Test = Callable[[Conditions], bool]
-# What each phase turns into: the first test that holds decides, and none of them means that it stays.
+# Transitions of each phase: the first test that is true selects the next phase; with none the phase stays.
 TRANSITIONS: dict[Phase, tuple[tuple[Test, Phase], ...]] = {
     Phase.UNKNOWN: ((lambda now: True, Phase.CHECKS_FAILED),),
     Phase.CHECKS_FAILED: (
@@ -95,7 +95,7 @@ TRANSITIONS: dict[Phase, tuple[tuple[Test, Phase], ...]] = {
         (lambda now: now.flying, Phase.FLYING),
     ),
     Phase.RESET: ((lambda now: True, Phase.CHECKS_FAILED),),
-    # Motors that are off do not end it: a laptop that falls silent within 2 s of the last thrust is locked.
+    # Motors that are off do not end this phase: a drone whose laptop falls silent within 2 s of the last thrust locks.
     Phase.LEVEL_OUT: (
         (lambda now: now.timed_out or now.tumbled or now.emergency, Phase.STOPPED),
         (lambda now: not now.silent, Phase.FLYING),
@@ -110,21 +110,21 @@ TRANSITIONS: dict[Phase, tuple[tuple[Test, Phase], ...]] = {
 
 
 def after(phase: Phase, now: Conditions) -> Phase:
-    """The phase that follows `phase` under the conditions of one look."""
+    """Return the phase that follows `phase` under the conditions `now`."""
     return next((new for test, new in TRANSITIONS[phase] if test(now)), phase)
 
 
 class Supervisor:
-    """State of one drone's supervisor. `look` is called every `PERIOD`."""
+    """Supervisor of one drone; `look`, its update, is called every `PERIOD`."""
 
     def __init__(self, kind: DroneKind, now: float = 0.0, booted: bool = True):
-        """At `now` [s]: ready for its first command, or, not `booted`, at its first look."""
+        """Start at `now` [s], with its checks passed if `booted`, else before its first update."""
         self.kind = kind
         self.phase = Phase.UNKNOWN
         self.armed = self.crashed = self.emergency = self.tumbled = False
-        self.stopped = 0.0  # parameter stabilizer.stop: an emergency as long as it is not 0
+        self.stopped = 0.0  # parameter stabilizer.stop: an emergency while it is not 0
         self.tumble_check = 1.0
-        self.crash_force = 0.0  # [g] beyond 1 g at which it counts as tumbled; 0: none
+        self.crash_force = 0.0  # [g] deviation of the acceleration from 1 g that counts as tumbled; 0: off
         self.keepalive: float | None = None
         self.preflight_time, self.landed_time = PREFLIGHT_TIME, LANDED_TIME
         self._thrust_time: float | None = None
@@ -138,34 +138,34 @@ class Supervisor:
 
     @property
     def can_fly(self) -> bool:
-        """True where setpoints are executed."""
+        """True in phases that execute setpoints."""
         return self.phase in CAN_FLY
 
     @property
     def motors_allowed(self) -> bool:
-        """True where the motors turn, if only at idle."""
+        """True in phases in which the motors turn, at idle at least."""
         return self.phase in MAY_RUN
 
     def request_arming(self, wanted: bool) -> bool:
-        """Arm or disarm; true if that is done or was so already."""
+        """Arm or disarm; return whether the drone is in the `wanted` state."""
         if wanted and not self.armed and self.phase is not Phase.CHECKS_PASSED:
             return False
         self.armed = wanted
         return True
 
     def crash(self) -> None:
-        """Find that it has crashed, as after a tumble in flight."""
+        """Enter the crashed phase, as after a tumble in flight."""
         self._enter(Phase.CRASHED, self._ready_since)
 
     def recover(self) -> bool:
-        """Forget a crash; false while it is still tumbled."""
+        """Clear a crash; return false while the drone is still tumbled."""
         if self.crashed and self.tumbled:
             return False
         self.crashed = False
         return True
 
     def look(self, now: float, age: float, pwm: Sequence[float], acceleration: Sequence[float]) -> None:
-        """One look at `now` [s]: `age` of the setpoint [s], `pwm` of the motors, `acceleration` (3,) measured [g]."""
+        """Update at `now` [s] by the setpoint's `age` [s], the motors' `pwm` (4,), measured `acceleration` (3,) [g]."""
         if max(pwm) > self.kind.idle:
             self._thrust_time = now
         flying = self._thrust_time is not None and now - self._thrust_time < FLYING_KEPT

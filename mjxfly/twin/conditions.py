@@ -1,4 +1,4 @@
-"""What a rehearsal meets: which drones, what surrounds them, which faults come; and the flags that ask for it."""
+"""Conditions of a rehearsal: kinds of drones, surroundings, load, faults; and their command line flags."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from mjxball.control import motors
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.errors import InputError
 
-OLDER_FORCE = motors.OLDER  # [N] shares of p^2 and p, p = PWM / 65535: a fit that ignores the voltage
+OLDER_FORCE = motors.OLDER  # [N] coefficients of p^2 and p, p = PWM / 65535: a fit that ignores the voltage
 
 
 @dataclass(frozen=True)
 class DroneKind:
     """A Crazyflie and the build of its firmware. The default is a 2.1 as delivered, with firmware 2026.08."""
 
-    device: str = "Crazyflie 2.1"  # what it calls itself
+    device: str = "Crazyflie 2.1"  # device type that it reports
     version: str = "2026.08"  # of its firmware
-    motor: str = "2.1"  # of `control.motors.MOTORS`
+    motor: str = "2.1"  # key of `control.motors.MOTORS`
     compensated: bool = True  # thrust is converted to PWM by the battery's voltage; else thrust is PWM
     older_force: bool = False  # the true force is `OLDER_FORCE`, whatever the voltage
     auto_arm: bool = True  # arms itself as soon as its checks pass
@@ -30,7 +30,7 @@ class DroneKind:
 
     @property
     def constants(self) -> Motor:
-        """Its motor's."""
+        """Constants of its motors."""
         return MOTORS[self.motor]
 
 
@@ -49,7 +49,7 @@ CURVES = {
 
 
 def drone_kind(drone: str = "2.1", curve: str = "linear") -> DroneKind:
-    """The kind of drone by the names of `DRONES` and `CURVES`."""
+    """Return the kind of drone for keys of `DRONES` and `CURVES`."""
     return replace(DRONES[drone], **CURVES[curve])  # type: ignore[arg-type]
 
 
@@ -58,23 +58,23 @@ class AddedLoad(NamedTuple):
 
     mass: float  # [kg]
     offset: float  # of its centre from O along the stick, toward the leader [m]
-    after: float  # the first motor has turned [s]
+    after: float  # time since the first motor turned [s]
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Conditions around the drones in a rehearsal, which the laptop does not know."""
+    """Sensor noise, positioning, link delay and motor gains in a rehearsal, which the laptop does not know."""
 
     noise: float = 1.0  # factor on the noise of IMU and pose
     pose_hz: float = 100.0  # poses of the positioning system [Hz]
-    deck: bool = True  # each drone has its own positioning; else poses come from the laptop, or none do
-    delay: float = 0.0  # of every datagram each way, from the first one on [s]
+    deck: bool = True  # each drone measures its position on board; else poses come from the laptop or not at all
+    delay: float = 0.0  # of every datagram each way [s]
     gains: tuple[float, float] = (1.0, 1.0)  # factors on the motor forces of leader and follower
-    exact: bool = False  # the estimates are the truth: for comparisons with the simulation
-    load: AddedLoad | None = None  # put on in flight
+    exact: bool = False  # the estimates are the true state: for comparisons with the simulation
+    load: AddedLoad | None = None  # attached in flight
     seed: int = 0
-    pose_loss: float = 0.0  # share of the positioning system's poses that never come
-    positioning: str = "mocap"  # one of `POSITIONING`: what a deck measures
+    pose_loss: float = 0.0  # fraction of the positioning system's poses that are lost
+    positioning: str = "mocap"  # positioning system, one of `POSITIONING`
 
 
 POSITIONING = ("mocap", "lighthouse", "loco", "flow")  # see `positioning`
@@ -82,13 +82,13 @@ DELIVERED = DroneKind()
 QUIET = Surroundings()
 
 
-# Numbers with least and most.
+# Bounds of the flags' values.
 RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
 LOAD_RANGES = ((0.0, 0.1), (-0.15, 0.15), (0.0, 3600.0))  # of `AddedLoad`
 
 
 def add_twin_options(parser: argparse._ActionsContainer) -> None:
-    """Add --twin-drone and the others to `parser`; None by default."""
+    """Add the flags --twin-... to `parser`; their default is None."""
     about = "--rehearse: "
     add = parser.add_argument
     add("--twin-drone", choices=tuple(DRONES), help=f"{about}what drones the twin is (2.1)")
@@ -107,7 +107,7 @@ def add_twin_options(parser: argparse._ActionsContainer) -> None:
 
 
 def check_twin(options: argparse.Namespace) -> None:
-    """Raise InputError for what no twin can be."""
+    """Raise InputError for values out of range and combinations that the twin does not support."""
     for name, (low, high) in RANGES.items():
         value = getattr(options, f"twin_{name}")
         if value is not None and not low <= value <= high:
@@ -129,7 +129,7 @@ def check_twin(options: argparse.Namespace) -> None:
 
 
 def given_twin_options(options: argparse.Namespace) -> list[str]:
-    """The flags that were given, as the twin's process takes them."""
+    """Return the --twin-... flags of `options` as arguments for the twin's process."""
     flags = []
     for name, value in vars(options).items():
         if name.startswith("twin_") and value is not None:
@@ -139,7 +139,7 @@ def given_twin_options(options: argparse.Namespace) -> list[str]:
 
 
 def surroundings(options: argparse.Namespace) -> Surroundings:
-    """The `Surroundings` of `options`. Raises InputError."""
+    """Return the `Surroundings` that `options` describe. Raises InputError."""
     check_twin(options)
     given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed", "gains")}
     given = {name: tuple(one) if name == "gains" else one for name, one in given.items() if one is not None}
@@ -159,19 +159,19 @@ class Battery:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Load, motors and batteries in a rehearsal, which the laptop does not know. The CG moves once a motor turns."""
+    """Load, motors and batteries in a rehearsal, unknown to the laptop. The CG moves from the first motor turn on."""
 
     object_mass: float  # [kg]
     cg_amplitude: float = 0.0  # of a prescribed sine [m]
     cg_speed: float = 0.0  # [rad/s]
-    ball: float = 0.0  # where a rolling ball lies at the start, from O [m]
+    ball: float = 0.0  # offset of a rolling ball from O at the start [m]
     rotor_lag: float = 1.0  # factor on the motors' time constant
     thrust: tuple[float, float] = (1.0, 1.0)  # factor on the motor forces of leader and follower
     battery: Battery = Battery()
 
     @classmethod
     def of(cls, config: Config) -> Conditions:
-        """The middle of what the policy was trained for; a rolling ball lies half way to its farthest start."""
+        """Return the means of the training ranges of `config`; a rolling ball starts at half its largest offset."""
         ranges = config.scenario
         amplitude, speed = (sum(pair) / 2 for pair in (ranges.cg_amplitude, ranges.cg_speed))
         return cls(sum(ranges.object_mass) / 2, amplitude, speed, ranges.ball_start / 2)
@@ -179,9 +179,9 @@ class Conditions:
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """What happens to datagrams of one drone. The default is a perfect link."""
+    """Faults of one drone's link. The default is a perfect link."""
 
-    loss: float = 0.0  # share of datagrams that vanish, each way
+    loss: float = 0.0  # fraction of datagrams that are lost, each way
     delay: float = 0.0  # of every datagram [s]
     jitter: float = 0.0  # added delay, uniform from 0 to this [s]: datagrams may overtake each other
     silent_up: bool = False  # nothing reaches the drone
@@ -190,34 +190,34 @@ class LinkFaults:
 
 @dataclass(frozen=True)
 class DroneFaults:
-    """What one drone gets wrong. The default is nothing."""
+    """Faults of one drone's computer. The default is none."""
 
     frozen: bool = False  # the estimator repeats its last state, the clock goes on
     clock_stopped: bool = False  # time stamps stand still
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # added to the reported position [m]
     battery: float = 0.0  # added to the reported voltage [V]
     garbage: float = 0.0  # datagrams of random bytes sent for each step
-    stabilizer_dead: bool = False  # its task hangs: the log goes on with fresh stamps and frozen values, PWM stays
-    stopped: bool = False  # the program hangs: nothing is answered, PWM stays
-    peer_silent: bool = False  # apps: no heartbeat of it arrives at the other drone
-    restarts: bool = True  # the microcontroller's watchdog restarts what hangs; else its motors stay off
+    stabilizer_dead: bool = False  # its task hangs: logs have new time stamps and frozen values, PWM is held
+    stopped: bool = False  # the program hangs: nothing is answered, PWM is held
+    peer_silent: bool = False  # apps: the other drone receives none of its heartbeats
+    restarts: bool = True  # the microcontroller's watchdog restarts a program that hangs; else its motors stay off
 
 
 class BodyFault(NamedTuple):
-    """What happens to the body of a drone, see `Pair.disturb`."""
+    """Fault of a drone's positioning, battery or motors, an argument of `Pair.disturb`."""
 
-    what: str  # of its poses, see `positioning.Positioning.disturb`; "battery", "fade", "gain"
+    what: str  # "battery" [V], "fade" [V/s], "gain" (factor), or of its poses, see `Positioning.disturb`
     value: float
 
 
-What = LinkFaults | DroneFaults | BodyFault | str  # faults of the link, of a drone, or what the twin does to it
+What = LinkFaults | DroneFaults | BodyFault | str  # str: an action of the twin, see `TwinDrone.inject`
 
 
 class FaultKind(NamedTuple):
-    """What `--fault KIND:DRONE@S` does."""
+    """A kind of `--fault KIND:DRONE@S`."""
 
     what: What
-    about: str  # of the drone or its link
+    about: str  # description for the documentation
 
 
 HUNG = DroneFaults(stabilizer_dead=True)
@@ -252,16 +252,16 @@ FAULT_KINDS = {
 
 
 class Injection(NamedTuple):
-    """A fault that comes during a rehearsal."""
+    """A fault to inject during a rehearsal."""
 
     what: What
     drone: int  # 0 leader, 1 follower
-    after: float  # the first motor has turned [s]
-    text: str = ""  # that asked for it
+    after: float  # time since the first motor turned [s]
+    text: str = ""  # the value of --fault
 
 
 def read_fault(text: str) -> Injection:
-    """The fault of `KIND:DRONE@S`, such as `frozen:follower@3`. Raises InputError."""
+    """Parse `KIND:DRONE@S`, such as `frozen:follower@3`. Raises InputError."""
     match = re.fullmatch(r"([\w-]+):(leader|follower)@(\d{1,4}(?:\.\d+)?)", text)
     if match is None or match[1] not in FAULT_KINDS:
         raise InputError(

@@ -1,8 +1,8 @@
-"""The coupled Crazyflie model behind the twin: both drones' computers, motors and batteries over C MuJoCo.
+"""The coupled Crazyflie model of the twin: both drones' computers, motors and batteries on C MuJoCo.
 
-MuJoCo steps the model of `mjxball.assembly` every millisecond, with legs and a floor added, so that the pair stands on
-the ground (a stand: on its rest, its lowest place) and takes off and lands by contact. The cascade is that of
-`control.crazyflie`, flown on each drone's own estimates; what moves the ball is `physics.motion`, as in simulation.
+MuJoCo steps the model of `mjxball.assembly` every millisecond. Legs and a floor are added, so that the pair stands on
+the ground (on a stand: at its lowest position) and takes off and lands by contact. Each drone runs the cascade of
+`control.crazyflie` on its estimates. `physics.motion` moves the ball, as in simulation.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from mjxfly.twin.estimators import matrix_of, skew
 from mjxfly.twin.pair import RUNNING, Modes, PairState
 
 STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
-LEG = 0.03  # [m] from a drone's centre down to what it stands on
-FOOT_OFFSET = 0.03  # [m] from a drone's centre sideways to each of its legs
-FOOT = 0.003  # [m] radius
+LEG = 0.03  # [m] from a drone's centre down to the centre of its feet
+FOOT_OFFSET = 0.03  # [m] from a drone's centre to its feet, along x and along y
+FOOT = 0.003  # [m] radius of a foot
 
 
 def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
-    """The assembly's model with contact: O is at height 0 while the drones' legs stand on the floor."""
+    """Return the assembly's model with legs, floor and contact; O is at height 0 when the drones stand on the floor."""
     plant = dataclasses.replace(config.plant, object_mass=object_mass)
     spec = build_spec(plant, STEP)
     disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -52,15 +52,14 @@ def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
         for sensor in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
             spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu")
     model = spec.compile()
-    model.actuator_ctrllimited[:] = False  # what a motor can give is `Power`'s to say, which knows the battery
+    model.actuator_ctrllimited[:] = False  # `Power` limits the motors, by the battery's voltage
     return model
 
 
 def put_on(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> None:
-    """Fix a body of `mass` [kg] without size to the stick of `model`, `offset` [m] from O along the CG axis.
+    """Fix a point mass of `mass` [kg] to the stick of `model` at `offset` [m] from O, its centre, along the CG axis.
 
-    The stick's own centre is O. The state is not touched: position and velocity of O carry over, as of a load that
-    moves with the stick when it is let go.
+    Position and velocity of O do not change: the load moves with the stick when it is attached.
     """
     body, axis = model.body(ASSEMBLY).id, "xy".index(plant.cg_axis)
     before = float(model.body_mass[body])
@@ -72,12 +71,12 @@ def put_on(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> N
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-WORN_SAG = 0.47  # [V] at full power: with 3.0 V the pair falls as on the real firmware's rig, 1.15 m/s after 0.65 s
-SENSED = 6  # numbers of one drone's accelerometer and gyroscope
+WORN_SAG = 0.47  # [V] at full power; with 3.0 V the pair falls as with the real firmware: 1.15 m/s after 0.65 s
+SENSED = 6  # values of one drone's accelerometer and gyroscope
 
 
 class CoupledPair:
-    """See `physics.Pair`. One instance is one pair; `start` begins anew and keeps the parameters."""
+    """Implements `Pair`. `start` resets the state and keeps the written parameters."""
 
     def __init__(
         self,
@@ -120,12 +119,12 @@ class CoupledPair:
         self._rotors, self._targets = np.zeros((2, 4)), np.zeros((2, 4))
         self.power = self.onboard.power = self._new_power()
         self._steps, self._flown = 0, 0.0
-        self._left, self._moving = 0.0, False
+        self._time_left, self._moving = 0.0, False
         self._place_ball()
         return self._settle()
 
     def place(self, state: PlantState) -> PairState:
-        """Put the pair, motors running, into a simulation's `state` (one world) and return it."""
+        """Set the pair to a simulation's `state` (no batch), with running motors, and return the new state."""
         data = self.data
         if self._free:
             data.qpos[:7], data.qvel[:6] = [*state.position, *state.quaternion], [*state.velocity, *state.rates]
@@ -143,7 +142,7 @@ class CoupledPair:
         return placed
 
     def _settle(self) -> PairState:
-        """Let sensors and estimators know where the pair is."""
+        """Initialise sensors and estimators at the pair's true state; return it."""
         mujoco.mj_forward(self.model, self.data)
         position, _, matrix = self._pose()
         velocity = self._velocity(matrix)
@@ -162,7 +161,7 @@ class CoupledPair:
     def disturb(self, drone: int, what: str, value: float) -> None:
         """See `Pair.disturb`."""
         match what:
-            case "battery":  # a cell that gives way has a higher resistance
+            case "battery":  # a failing cell has a higher resistance
                 self.power.charge[drone], self.power.sag[drone] = value, WORN_SAG
             case "fade":
                 self.power.fading[drone] = value
@@ -172,11 +171,11 @@ class CoupledPair:
                 self.onboard.positioning[drone].disturb(what, value)
 
     def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
-        """See `Pair.advance`; `dt` is made of whole milliseconds, what is left over is made good later."""
-        self._left += dt
+        """See `Pair.advance`. Steps are whole milliseconds; the rest of `dt` is carried over to the next call."""
+        self._time_left += dt
         self.onboard.order(np.asarray(setpoints, float), modes)
-        count = round(self._left / STEP)
-        self._left -= count * STEP
+        count = round(self._time_left / STEP)
+        self._time_left -= count * STEP
         for _ in range(count):
             self._step()
         return self._state()
@@ -189,8 +188,10 @@ class CoupledPair:
             self._loaded = True
         mujoco.mj_step1(model, data)
         if self._steps % TICK == 0:
-            self._fly()
-        gap = self._rotors - self._targets  # of the motors' lag, from the step's begin to its end and in the mean
+            self._run_cascades()
+        gap = (
+            self._rotors - self._targets
+        )  # at the start of the step; `_keep` of it is left at the end, `_mean` on average
         self._rotors = self._targets + self._keep * gap
         data.ctrl[:] = (self._targets + self._mean * gap).ravel()
         data.qfrc_applied[self._slide] = self._push_ball()
@@ -201,8 +202,8 @@ class CoupledPair:
         if not self.surroundings.exact:
             self.onboard.sense(self._steps, self._sensed(), self._pose)
 
-    def _fly(self) -> None:
-        """Both cascades, once: what the motors are to give from here on."""
+    def _run_cascades(self) -> None:
+        """Run both cascades once and set the motors' target forces."""
         if self.surroundings.exact:
             euler = rotations.euler_from_matrix(self.data.xmat[self._body].reshape(3, 3))
             pwm = self.onboard.control(np.stack([euler] * 2), np.stack([self._rates()] * 2))
@@ -219,7 +220,7 @@ class CoupledPair:
     # The ball.
 
     def _push_ball(self) -> float:
-        """Force on the ball along its slide [N]: friction and stops, or what its prescribed motion takes."""
+        """Force on the ball along its slide [N]: friction and stops, or the force that its prescribed motion needs."""
         model, data = self.model, self.data
         if self._rolling:
             offset, rate = data.qpos[self._slide_position], data.qvel[self._slide]
@@ -229,12 +230,12 @@ class CoupledPair:
         assert self._prescribed is not None
         data.qfrc_applied[self._slide] = 0.0
         mujoco.mj_fwdActuation(model, data)
-        wanted = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
+        acceleration = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
         slides = slice(self._slide, self._slide + 1)
-        return float(slide_force(model, data, slides, wanted, data.qfrc_actuator - data.qfrc_bias)[0])
+        return float(slide_force(model, data, slides, acceleration, data.qfrc_actuator - data.qfrc_bias)[0])
 
     def _place_ball(self) -> None:
-        """Put a prescribed ball where it is to be, so that no error adds up; a rolling one at its start."""
+        """Set a prescribed ball to its trajectory, against integration drift; a rolling one to its start in step 0."""
         if self._rolling:
             if self._steps == 0:
                 self.data.qpos[self._slide_position] = self.conditions.ball
@@ -246,18 +247,18 @@ class CoupledPair:
 
     @property
     def cg_offset(self) -> float:
-        """Where the CG is, from O along the stick [m]."""
+        """See `Pair.cg_offset`."""
         return float(self._share * self.data.qpos[self._slide_position])
 
     @property
     def rotor_force(self) -> np.ndarray:
-        """(2, 4) of leader and follower [N]."""
+        """See `Pair.rotor_force`."""
         return self._rotors.copy()
 
-    # What the sensors are shown, and the truth.
+    # Sensor inputs and true state.
 
     def _sensed(self) -> np.ndarray:
-        """(2, 6) specific force [m/s2] and rates [rad/s] of both drones, body axes, one step old."""
+        """(2, 6) specific force [m/s2] and rates [rad/s] of both drones, body axes, of the previous step."""
         return self.data.sensordata.reshape(2, SENSED)
 
     def _quaternion(self) -> np.ndarray:
@@ -265,12 +266,12 @@ class CoupledPair:
         half = 0.0 if self._free else q[self._roll] / 2
         return q[3:7].copy() if self._free else np.array([math.cos(half), math.sin(half), 0.0, 0.0])
 
-    def _of_origin(self, numbers: np.ndarray) -> np.ndarray:
-        """O's (3,) in the world, from the joints' positions or velocities."""
-        return numbers[:3] if self._free else np.array([0.0, 0.0, numbers[0] if self._heaves else 0.0])
+    def _of_origin(self, joints: np.ndarray) -> np.ndarray:
+        """O's position or velocity (3,) in the world from the joints' positions or velocities."""
+        return joints[:3] if self._free else np.array([0.0, 0.0, joints[0] if self._heaves else 0.0])
 
     def _pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Both drones' positions (2, 3), the quaternion (4,) and the rotation matrix of all."""
+        """Positions (2, 3) of both drones, and the body's quaternion (4,) and rotation matrix (3, 3)."""
         quaternion = self._quaternion()
         matrix = matrix_of(quaternion)
         return self._of_origin(self.data.qpos) + self._mounts @ matrix.T, quaternion, matrix

@@ -1,4 +1,4 @@
-"""One drone of the twin: its protocol, its firmware, its faults, and both ways of its link."""
+"""One drone of the twin: protocol, firmware, app, faults, and both directions of its link."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mjxfly.twin.protocol import Peer
 
 GRAVITY = 9.81  # [m/s2]
 BEAT = 2  # periods of an app between two heartbeats
-# Parameters of the supervisor, each with its field there and the factor to its unit.
+# Parameters of the supervisor: attribute of `Supervisor`, and factor to its unit.
 SUPERVISOR = {
     "supervisor.prefltTimeout": ("preflight_time", 1e-3),
     "supervisor.landedTimeout": ("landed_time", 1e-3),
@@ -32,20 +32,20 @@ SUPERVISOR = {
     "supervisor.crashDetectGs": ("crash_force", 1.0),
     "stabilizer.stop": ("stopped", 1.0),
 }
-# Parameters on which the twin acts; all others it only keeps.
+# Parameters with an effect on the twin; the others are only stored.
 ACTED = avionics.ACTED | SUPERVISOR.keys() | {CONTROLLER} | {one.name for one in OF_APP if not one.read_only}
 
 
 def only_kept(names: Iterable[str]) -> list[str]:
-    """Those of `names` that the twin has and does not act on."""
+    """Return those of `names` that the twin stores without an effect."""
     return sorted({one.name for one in PARAMETERS}.intersection(names) - ACTED)
 
 
 class TwinDrone:
-    """What answers at one address. `receive`, `step` and `send` are called by one thread."""
+    """A drone at one address. One thread calls `receive`, `step` and `send`."""
 
     def __init__(self, pair: Pair, number: int, core: Library | None = None):
-        """Drone `number` (0 leader, 1 follower) of `pair`; `core`: the app on board, none without one."""
+        """Drone `number` (0 leader, 1 follower) of `pair`; `core`: the compiled app on board, if any."""
         self._pair, self.number = pair, number
         self._random = np.random.default_rng([pair.surroundings.seed, number])
         self.firmware = Firmware(pair.kind, phase=float(self._random.random()))
@@ -61,7 +61,7 @@ class TwinDrone:
     def _new_peer(self) -> Peer:
         return Peer(
             self.firmware,
-            self._written,
+            self._on_parameter,
             functools.partial(self._pair.receive_pose, self.number),
             self.app,
             ({ESTIMATOR: KALMAN} if self._pair.surroundings.deck else {})
@@ -69,12 +69,12 @@ class TwinDrone:
         )
 
     def _new_app(self) -> App | None:
-        self.beat = b""  # heartbeat that is on its way to the other drone
+        self.beat = b""  # heartbeat in transit to the other drone
         self._ticks, self._next_tick, self._app_ran = 0, 0.0, False
-        self._handed = State()  # by the app's own controller, which alone is given the estimate
+        self._app_state = State()  # set by the out-of-tree controller, the only access of an app to the estimate
         return None if self._core is None else App(self._core, self.number)
 
-    def _written(self, name: str, value: float) -> None:
+    def _on_parameter(self, name: str, value: float) -> None:
         if name in SUPERVISOR:
             field, factor = SUPERVISOR[name]
             setattr(self.firmware.supervisor, field, value * factor)
@@ -84,16 +84,16 @@ class TwinDrone:
 
     @property
     def controller(self) -> int:
-        """Number of the controller in use."""
+        """Value of the parameter stabilizer.controller."""
         return int(self.peer.values[CONTROLLER])
 
     def receive(self, datagram: bytes, now: float) -> None:
-        """A datagram came from the laptop."""
+        """Put a datagram of the laptop into the link."""
         self.up.push(datagram, now, self.link, self.link.silent_up, self._pair.surroundings.delay)
 
     @property
     def next_arrival(self) -> float:
-        """When `answer` has something to do again [s]."""
+        """Time of the next datagram that leaves the link, in either direction [s]."""
         return min(self.up.next, self.down.next)
 
     @property
@@ -101,7 +101,7 @@ class TwinDrone:
         return self.faults.stopped or self.firmware.dead or self.firmware.booting
 
     def inject(self, what: What) -> None:
-        """Have a fault come to pass; "port" is the socket's, not the drone's."""
+        """Inject a fault; "port" is handled by the server."""
         match what:
             case LinkFaults():
                 self.link = what
@@ -109,38 +109,38 @@ class TwinDrone:
                 self.faults = what
             case BodyFault(part, value):
                 self._pair.disturb(self.number, part, value)
-            case "crash":  # the firmware finds that it has crashed: its motors stop
+            case "crash":  # the firmware detects a crash: motors off
                 self.firmware.supervisor.crash()
-            case "power":  # its motors stop and its address answers nothing, not even that it is closed
+            case "power":  # motors off, no answers at all
                 self.firmware.dead = True
                 self.link = LinkFaults(silent_up=True, silent_down=True)
-            case "reboot":  # its power fails for a moment
+            case "reboot":
                 self.reboot()
 
     def answer(self, now: float) -> None:
-        """Handle what has arrived by `now` [s]."""
+        """Handle the datagrams that have arrived by `now` [s]."""
         for due, datagram in self.up.due(now):
             for reply in [] if self._silent else self.peer.receive(datagram, due):
                 self._reply(reply, due)
 
     def step(self, state: PairState, now: float) -> Order:
-        """Handle what has arrived, and return what the firmware lets through."""
+        """Handle arrived datagrams, run the app and the firmware; return the controller's input."""
         self._now = now
         self.answer(now)
-        report, mine, wrong = state.report, self.number, self.faults
-        hung = wrong.stopped or wrong.stabilizer_dead
-        if not (wrong.stopped or self.firmware.dead or self.firmware.booting):
+        report, number, faults = state.report, self.number, self.faults
+        hung = faults.stopped or faults.stabilizer_dead
+        if not (faults.stopped or self.firmware.dead or self.firmware.booting):
             self._run_app(state, now)
         before = self.firmware.supervisor
-        acceleration = (report.acceleration[mine] / GRAVITY).tolist()
-        order = self.firmware.step(now, acceleration, report.pwm[mine].tolist(), hung, wrong.restarts)
+        acceleration = (report.acceleration[number] / GRAVITY).tolist()
+        order = self.firmware.step(now, acceleration, report.pwm[number].tolist(), hung, faults.restarts)
         if self.controller not in (PID, OUT_OF_TREE):
             order = self.firmware.order = Order(ZERO, Motors.OFF)
         if self.firmware.supervisor is not before:
-            self._forget(now)
-        if not wrong.clock_stopped:
+            self._reset(now)
+        if not faults.clock_stopped:
             self._stamp = now - self._booted
-        frozen = wrong.frozen or (hung and order.motors is Motors.HELD)
+        frozen = faults.frozen or (hung and order.motors is Motors.HELD)
         if not frozen or self._readings is None:
             self._readings = Readings(self._snapshot(state))
         elif not hung:
@@ -148,18 +148,18 @@ class TwinDrone:
         return order
 
     def _run_app(self, state: PairState, now: float) -> None:
-        """A period of the app, if one is due: its task takes the newest estimate and sends a setpoint."""
+        """Run one period of the app, if it is due: the app takes the newest estimate and sends a setpoint."""
         if self.app is None or now < self._next_tick - 1e-9:
             return
         self._next_tick = max(self._next_tick, now - 1e-9) + self.app.period / 1000
-        seen = self._readings.snapshot if self.faults.frozen and self._readings else self._snapshot(state)
-        report, mine, estimate, clock = seen.report, self.number, self._handed, round(1000 * now)
+        snapshot = self._readings.snapshot if self.faults.frozen and self._readings else self._snapshot(state)
+        report, number, estimate, clock = snapshot.report, self.number, self._app_state, round(1000 * now)
         if self.controller == OUT_OF_TREE and not self.faults.stabilizer_dead:
-            estimate.position[:], estimate.velocity[:] = seen.position.tolist(), report.velocity[mine].tolist()
-            estimate.quaternion[:], estimate.rates[:] = report.quaternion[mine].tolist(), report.rates[mine].tolist()
-            estimate.time = clock
-        estimate.variance[:] = report.variance[mine][:3].tolist()
-        estimate.voltage, estimate.can_fly = seen.voltage, self.firmware.supervisor.can_fly
+            estimate.position[:], estimate.velocity[:] = snapshot.position.tolist(), report.velocity[number].tolist()
+            estimate.quaternion[:] = report.quaternion[number].tolist()
+            estimate.rates[:], estimate.time = report.rates[number].tolist(), clock
+        estimate.variance[:] = report.variance[number][:3].tolist()
+        estimate.voltage, estimate.can_fly = snapshot.voltage, self.firmware.supervisor.can_fly
         wanted = self.app.tick(estimate, clock)
         if wanted.active:
             self.firmware.commander.from_app(Setpoint(wanted.roll, wanted.pitch, 0.0, int(wanted.thrust)), now)
@@ -171,7 +171,7 @@ class TwinDrone:
         self._ticks += 1
 
     def hear(self, beat: bytes, now: float) -> None:
-        """A heartbeat of the other drone's app arrives, unless it is lost."""
+        """Deliver a heartbeat of the other drone's app, unless the link loses it."""
         lost = self.link.loss and self._random.random() < self.link.loss
         if self.app is not None and not self._silent and not lost:
             self.app.hear(beat, round(1000 * now))
@@ -185,7 +185,7 @@ class TwinDrone:
         return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, logged, deck)
 
     def send(self, now: float) -> list[bytes]:
-        """Datagrams that leave for the laptop at `now`."""
+        """Queue the log data that is due; return the datagrams that reach the laptop by `now` [s]."""
         if self._readings is not None and not self._silent and self.peer.logs.is_due(now):
             for datagram in self.peer.log_data(self._readings, now):
                 stamp = (int(self._stamp * 1000 + 1e-6) & 0xFFFFFF).to_bytes(3, "little")
@@ -195,18 +195,18 @@ class TwinDrone:
         return self.transmit(now)
 
     def transmit(self, now: float) -> list[bytes]:
-        """What has passed the link to the laptop by `now`."""
+        """Return the datagrams that have passed the link to the laptop by `now` [s]."""
         return [datagram for _, datagram in self.down.due(now)]
 
     def _reply(self, datagram: bytes, now: float) -> None:
         self.down.push(datagram, now, self.link, self.link.silent_down, self._pair.surroundings.delay)
 
     def reboot(self) -> None:
-        """Power off and on: log blocks and parameters are forgotten."""
+        """Power off and on: log blocks and parameters are reset."""
         self.firmware.reboot(self._now)
-        self._forget(self._now)
+        self._reset(self._now)
 
-    def _forget(self, now: float) -> None:
+    def _reset(self, now: float) -> None:
         self.app = self._new_app()
         self.peer = self._new_peer()
         self._booted = now
@@ -217,7 +217,7 @@ class TwinDrone:
 
 
 class Channel:
-    """One way of a link: datagrams go in, and come out late, or never."""
+    """One direction of a link, with delay, jitter and loss."""
 
     def __init__(self, random: np.random.Generator):
         self._random = random
@@ -225,7 +225,7 @@ class Channel:
         self._count = itertools.count()
 
     def push(self, datagram: bytes, now: float, faults: LinkFaults, silent: bool, delay: float = 0.0) -> None:
-        """Take a datagram in at time `now` [s]; `delay` [s] is added to that of `faults`."""
+        """Send a datagram at `now` [s]; `delay` [s] is added to that of `faults`."""
         if silent or (faults.loss and self._random.random() < faults.loss):
             return
         due = now + faults.delay + delay
@@ -234,7 +234,7 @@ class Channel:
         heapq.heappush(self._waiting, (due, next(self._count), datagram))
 
     def due(self, now: float) -> list[tuple[float, bytes]]:
-        """Datagrams that come out by `now` [s], in order, each with its time [s]."""
+        """Remove and return the datagrams that arrive by `now` [s], in order, each with its time [s]."""
         out = []
         while self._waiting and self._waiting[0][0] <= now + 1e-9:
             due, _, datagram = heapq.heappop(self._waiting)
@@ -243,12 +243,12 @@ class Channel:
 
     @property
     def next(self) -> float:
-        """When the next datagram comes out [s]."""
+        """Arrival time of the next datagram [s]."""
         return self._waiting[0][0] if self._waiting else math.inf
 
 
 def garbage(random: np.random.Generator) -> bytes:
-    """A datagram of random bytes; half of them begin with a port that is in use."""
+    """Return a datagram of random bytes; half of them start with a valid port."""
     size = int(random.integers(0, 40))
     data = bytearray(random.integers(0, 256, size, dtype=np.uint8).tobytes())
     if size and random.random() < 0.5:
@@ -258,7 +258,7 @@ def garbage(random: np.random.Generator) -> bytes:
 
 
 def advance(pair: Pair, drones: tuple[TwinDrone, TwinDrone], state: PairState, now: float, dt: float) -> PairState:
-    """Step both drones at `now` [s] and the physics `dt` [s] on."""
+    """Step both drones at `now` [s], then the physics by `dt` [s]; return the new state."""
     one, other = drones[0].step(state, now), drones[1].step(state, now)
     for drone, peer in (drones, drones[::-1]):
         if drone.beat and not drone.faults.peer_silent:

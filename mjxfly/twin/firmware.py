@@ -1,4 +1,4 @@
-"""What one drone's firmware lets through to its controller: commander and supervisor together, and their faults."""
+"""Firmware of one drone between radio and controller: commander, supervisor, boot, and hangs with watchdog restart."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from mjxfly.packets import ZERO, Setpoint
 from mjxfly.twin.arming import AIRBORNE, PERIOD, Phase, Supervisor
 from mjxfly.twin.conditions import DELIVERED, DroneKind
 
-THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors stand still; above: cut
-PLANNER_PERIOD = 0.01  # [s] of the high-level commander, whose planner never flies here: it asks for motors off
-UNSET, PLANNER, LAPTOP, APP = 0, 1, 2, 3  # priorities of who sent the setpoint
-WORST_ANGLE = 30.0  # [deg] in place of a number that is not finite: the real controller takes such a one as a kick
+THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors off; above: clipped
+PLANNER_PERIOD = 0.01  # [s] of the high-level commander, whose planner is idle here and requests motors off
+UNSET, PLANNER, LAPTOP, APP = 0, 1, 2, 3  # priority by the sender of the setpoint
+WORST_ANGLE = 30.0  # [deg] substitute for an angle that is not finite, to which the real controller reacts with a jerk
 
 
 class Commander:
-    """Thrust lock, priorities and the newest setpoint of one drone."""
+    """Commander of one drone: thrust lock, priorities, the newest setpoint."""
 
     def __init__(self, now: float = 0.0) -> None:
         self.setpoint, self.time = ZERO, now
         self.priority = UNSET
         self._locked = True
         self._planned = -math.inf
-        self.wire_thrust = 0  # of the last setpoint received, whatever became of it
+        self.wire_thrust = 0  # of the last setpoint received, executed or not
 
     def receive(self, value: Setpoint, now: float) -> None:
-        """Port 3: a setpoint of any values. After boot, thrust is 0 until a setpoint of thrust 0 came."""
+        """Handle a setpoint on port 3, of any values. After boot, thrust stays 0 until a setpoint of thrust 0 came."""
         if self.priority == UNSET:
             self._locked = True
         if value.thrust == 0:
@@ -40,26 +40,26 @@ class Commander:
         self._take(Setpoint(roll, pitch, yaw_rate, thrust), now, LAPTOP)
 
     def from_app(self, value: Setpoint, now: float) -> None:
-        """A setpoint of an app on board: no thrust lock, and before the laptop's."""
+        """Handle a setpoint of an app on board: no thrust lock, and a higher priority than the laptop's."""
         self._take(value, now, APP)
 
     def stop(self, now: float) -> None:
-        """Port 7, stop: a setpoint that turns the motors off; the thrust lock stays open."""
+        """Handle a stop on port 7: motors off; the thrust lock stays open."""
         self.wire_thrust = 0
         self._take(ZERO, now, LAPTOP)
 
     def relax(self) -> None:
-        """Port 7, the laptop's setpoints end here: the planner takes over."""
+        """Handle the end of the laptop's setpoints on port 7: the planner takes over."""
         self.priority = PLANNER
 
     def poll(self, now: float, can_fly: bool) -> None:
-        """What the planner does: its setpoints never grow old, and turn the motors off."""
+        """Run the idle planner: it renews a setpoint with motors off."""
         if can_fly and self.priority <= PLANNER and now - self._planned >= PLANNER_PERIOD:
             self._planned = now
             self._take(ZERO, now, PLANNER)
 
     def age(self, now: float) -> float:
-        """Of the setpoint [s]."""
+        """Age of the setpoint [s]."""
         return now - self.time
 
     def _take(self, value: Setpoint, now: float, priority: int) -> None:
@@ -68,34 +68,34 @@ class Commander:
 
 
 BOOT_TIME = 1.0  # [s] from power on until the first setpoint can be executed
-LEVEL = (0.0, 0.0, 1.0)  # [g] what the accelerometer shows at rest
+LEVEL = (0.0, 0.0, 1.0)  # [g] accelerometer at rest
 STILL = (0.0, 0.0, 0.0, 0.0)
-WATCHDOG = 0.35  # [s] after which the microcontroller's own watchdog restarts a program that hangs
+WATCHDOG = 0.35  # [s] timeout of the microcontroller's watchdog
 
 
 class Motors(enum.Enum):
-    """What drives the motors."""
+    """State of the motors."""
 
-    RUN = "run"  # the controller, at idle at least
+    RUN = "run"  # driven by the controller, at idle at least
     OFF = "off"
-    HELD = "held"  # nothing: their PWM stays as it is
+    HELD = "held"  # PWM frozen, because the program hangs
 
 
 class Order(NamedTuple):
-    """What reaches the controller of one drone."""
+    """Input of one drone's controller."""
 
     setpoint: Setpoint = ZERO
     motors: Motors = Motors.RUN
-    flying: bool = False  # by the supervisor, for the estimator
+    flying: bool = False  # the supervisor's flag, an input of the estimator
 
 
 class Firmware:
-    """Time and measurements come in, an order for the controller comes out."""
+    """State machine of one drone's firmware: `step` maps time and measurements to the controller's input."""
 
     def __init__(self, kind: DroneKind = DELIVERED, now: float = 0.0, phase: float = 0.0):
-        """`phase` 0 .. 1 is where in its period of 40 ms the supervisor is at `now` [s]."""
+        """`phase` 0 .. 1: position of `now` [s] within the supervisor's period of 40 ms."""
         self.kind = kind
-        self._next_look = now + (1.0 - phase) * PERIOD
+        self._next_update = now + (1.0 - phase) * PERIOD
         self._start(now, booted=True)
 
     def _start(self, now: float, booted: bool) -> None:
@@ -107,10 +107,10 @@ class Firmware:
         self._hung_since: float | None = None
 
     def reboot(self, now: float) -> None:
-        """Power on at `now` [s]: everything is forgotten."""
+        """Reset everything as at power on at `now` [s]."""
         self._start(now, booted=False)
         self.booting_until = now + BOOT_TIME
-        self._next_look = self.booting_until
+        self._next_update = self.booting_until
 
     def step(
         self,
@@ -120,9 +120,9 @@ class Firmware:
         hung: bool = False,
         restarts: bool = True,
     ) -> Order:
-        """The order at `now` [s]; measured `acceleration` (3,) [g], `pwm` (4,) of the motors.
+        """Return the controller's input at `now` [s]; measured `acceleration` (3,) [g], `pwm` (4,) of the motors.
 
-        `hung`: the stabilizer does not run. The microcontroller's watchdog ends that, and the program `restarts`.
+        `hung`: the stabilizer does not run. The watchdog ends that: the program `restarts`, or its motors stay off.
         """
         self.order = self._hang(now, restarts) if hung and not self.dead else self._run(now, acceleration, pwm)
         return self.order
@@ -132,15 +132,15 @@ class Firmware:
         if self.dead or now < self.booting_until:
             return Order(ZERO, Motors.OFF)
         self.commander.poll(now, self.supervisor.can_fly)
-        while now >= self._next_look - 1e-9:
+        while now >= self._next_update - 1e-9:
             self.supervisor.look(now, self.commander.age(now), pwm, acceleration)
-            self._next_look += PERIOD
+            self._next_update += PERIOD
         phase = self.supervisor.phase
-        flown = self.commander.setpoint if self.supervisor.can_fly else ZERO
+        setpoint = self.commander.setpoint if self.supervisor.can_fly else ZERO
         if phase is Phase.LEVEL_OUT:
-            flown = Setpoint(0.0, 0.0, 0.0, flown.thrust)
+            setpoint = Setpoint(0.0, 0.0, 0.0, setpoint.thrust)
         motors = Motors.RUN if self.supervisor.motors_allowed else Motors.OFF
-        return Order(flown, motors, phase in AIRBORNE)
+        return Order(setpoint, motors, phase in AIRBORNE)
 
     def _hang(self, now: float, restarts: bool) -> Order:
         if self._hung_since is None:
@@ -155,15 +155,15 @@ class Firmware:
 
     @property
     def info(self) -> int:
-        """Bits of supervisor.info."""
+        """Log variable supervisor.info, a bit field."""
         return self.supervisor.info
 
     @property
     def locked(self) -> bool:
-        """True until it is rebooted."""
+        """True if only a reboot lets the motors run again."""
         return self.supervisor.phase is Phase.LOCKED
 
     @property
     def booting(self) -> bool:
-        """True between power on and the first look."""
+        """True between power on and the supervisor's first update."""
         return self.supervisor.phase is Phase.UNKNOWN

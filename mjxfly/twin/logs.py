@@ -1,4 +1,4 @@
-"""Log variables of one drone, computed when a packet asks for them, and its log blocks with the firmware's limits."""
+"""Log variables of one drone, computed on demand, and its log blocks with the firmware's limits."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from mjxfly.twin.estimators import euler_of, matrix_of
 from mjxfly.twin.pair import Report
 
 GRAVITY = 9.81  # [m/s2]
-# Type numbers of log variables, each with its struct code (crazyflie.md).
+# Type number and struct code of each type of log variables (docs/crazyflie.md).
 LOG_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h")}
 LOG_TYPES |= {"int32_t": (6, "i"), "float": (7, "f"), "FP16": (8, "e")}
 LOG_CODES = dict(LOG_TYPES.values())
 
 
 def listed(table: str) -> list[dict[str, str]]:
-    """Rows of `names.csv` in the order of the firmware's own table "log" or "param", with what its deck drivers add."""
+    """Return the rows of `names.csv` of the `table` "log" or "param", in the firmware's order, including its decks."""
     with Path(__file__).with_name("names.csv").open(encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if row["table"] == table]
 
 
 def item(type_byte: int, name: str) -> bytes:
-    """Type, group, name of one entry as the table of contents sends them."""
+    """Return type, group and name of one entry, encoded as in the table of contents."""
     group, _, variable = name.partition(".")
     return bytes([type_byte]) + group.encode() + b"\0" + variable.encode() + b"\0"
 
 
 LOG_VARIABLES: tuple[tuple[str, str], ...] = tuple((row["name"], row["type"]) for row in listed("log"))
 OF_APP = tuple((f"{GROUP}.{name}", kind) for name, kind in LOGGED)
-KNOWN = LOG_VARIABLES + OF_APP  # those of the app are listed by a drone that has one
+KNOWN = LOG_VARIABLES + OF_APP  # a drone without an app does not list `OF_APP`
 
 
 class Snapshot(NamedTuple):
-    """One drone at one moment."""
+    """State of one drone at one time, the source of its log variables."""
 
     report: Report  # of both drones
     drone: int
     setpoint: Setpoint
     info: int
     voltage: float  # [V]
-    position: np.ndarray  # (3,) that is reported [m]
-    app: Mapping[str, float] = {}  # what the app on board logs
-    deck: Mapping[str, float] = {}  # what its positioning deck logs, by full names
+    position: np.ndarray  # (3,) estimated [m], with the offset of a fault
+    app: Mapping[str, float] = {}  # log variables of the app on board, by names without the group
+    deck: Mapping[str, float] = {}  # log variables of the positioning deck, by full names
 
     @property
     def quaternion(self) -> np.ndarray:
@@ -88,8 +88,8 @@ def _estimate(one: Snapshot) -> dict[str, float]:
 def _compressed(one: Snapshot) -> dict[str, float]:
     values = _named("x y z", 1000 * one.position) | _named("vx vy vz", 1000 * one.report.velocity[one.drone])
     values |= _named("ax ay az", 1000 * GRAVITY * one.world_acceleration)
-    turning = 1000 * one.report.rates[one.drone] * np.array([1.0, -1.0, 1.0])
-    values |= _named("rateRoll ratePitch rateYaw", turning)
+    rates = 1000 * one.report.rates[one.drone] * np.array([1.0, -1.0, 1.0])
+    values |= _named("rateRoll ratePitch rateYaw", rates)
     return values | {"quat": packets.compress_quaternion(one.quaternion)}
 
 
@@ -142,7 +142,7 @@ GROUPS: dict[str, Callable[[Snapshot], dict[str, float]]] = {
 
 
 class Readings:
-    """Log variables of one drone at one moment, by their full names; what the twin does not have is 0."""
+    """Log variables of one drone at one time, by full names; those that the twin does not simulate are 0."""
 
     def __init__(self, snapshot: Snapshot):
         self.snapshot = snapshot
@@ -165,32 +165,32 @@ DELETE, START, STOP, RESET, CREATE, APPEND, START_MS = 2, 3, 4, 5, 6, 7, 8
 
 @dataclass
 class Block:
-    """A log block that was created."""
+    """A log block."""
 
     variables: list[tuple[str, str]] = field(default_factory=list)  # (name, struct code as fetched)
     period: float = 0.0  # [s], 0 while stopped
-    due: float = 0.0  # [s]
+    due: float = 0.0  # time of the next packet [s]
     once: bool = False  # send one packet only
 
     def is_due(self, now: float) -> bool:
-        """True if a packet leaves at `now` [s]."""
+        """True if a packet is due at `now` [s]."""
         return bool(self.period or self.once) and now >= self.due
 
 
 class Blocks:
-    """All blocks of one drone."""
+    """All log blocks of one drone."""
 
     def __init__(self, listed: Sequence[tuple[str, str]] = KNOWN) -> None:
-        """`listed` are the variables that the drone lists, in order."""
+        """`listed`: name and type of the drone's log variables, in the order of its table of contents."""
         self._listed = listed
         self.by_number: dict[int, Block] = {}
 
     def is_due(self, now: float) -> bool:
-        """True if `take` has something at `now` [s]."""
+        """True if a packet of any block is due at `now` [s]."""
         return any(block.is_due(now) for block in self.by_number.values())
 
     def take(self, readings: Readings | Mapping[str, float], now: float) -> list[bytes]:
-        """Payloads of all blocks that are due at `now`; their time stamp is `now` in ms."""
+        """Return the payloads of all blocks that are due at `now` [s]; their time stamp is `now` in ms."""
         sent = []
         for number, block in self.by_number.items():
             if block.is_due(now):
@@ -202,22 +202,22 @@ class Blocks:
         return sent
 
     def control(self, data: bytes, now: float) -> list[bytes]:
-        """Answer to a request on the control channel."""
+        """Return the answers to a request on the control channel."""
         if data[:1] == bytes([RESET]):
             self.by_number.clear()
             return [b"\x05\0\0"]
         if len(data) < 2:
             return []
-        return [data[:2] + bytes([self._obey(data[0], data[1], data[2:], now)])]
+        return [data[:2] + bytes([self._execute(data[0], data[1], data[2:], now)])]
 
-    def _obey(self, command: int, number: int, rest: bytes, now: float) -> int:
+    def _execute(self, command: int, number: int, rest: bytes, now: float) -> int:
         block = self.by_number.get(number)
         if command == CREATE:
             if block is not None:
                 return EXISTS
             if len(self.by_number) >= MAX_BLOCKS:
                 return NO_MEMORY
-            self.by_number[number] = Block()  # stays, even if what follows is refused
+            self.by_number[number] = Block()  # kept, even if its variables are refused
             return self._append(self.by_number[number], rest)
         if command not in (APPEND, START, START_MS, STOP, DELETE):
             return BAD
@@ -234,13 +234,13 @@ class Blocks:
         return 0
 
     def _append(self, block: Block, entries: bytes) -> int:
-        """Add (type, id) entries of 3 bytes; cflib sends one stray byte after the ninth, which is no entry."""
+        """Add (type, id) entries of 3 bytes; return an error code or 0. A stray byte, which cflib sends, is ignored."""
         for at in range(0, len(entries) - 2, 3):
             kind, index = entries[at] & 0x0F, struct.unpack("<H", entries[at + 1 : at + 3])[0]
             if kind not in LOG_CODES:
                 return UNKNOWN
             code = LOG_CODES[kind]
-            if struct.calcsize("<" + "".join([*(own for _, own in block.variables), code])) > MAX_BLOCK_BYTES:
+            if struct.calcsize("<" + "".join([*(known for _, known in block.variables), code])) > MAX_BLOCK_BYTES:
                 return TOO_BIG
             if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
                 return NO_MEMORY
@@ -264,7 +264,7 @@ _RANGES |= {"b": (-(2**7), 2**7 - 1), "h": (-(2**15), 2**15 - 1), "i": (-(2**31)
 
 
 def pack(code: str, value: float) -> bytes:
-    """`value` as bytes of a struct `code`, within its range."""
+    """Encode `value`, clipped to the range of the struct `code`."""
     if code in _RANGES:
         low, high = _RANGES[code]
         return struct.pack("<" + code, min(max(int(value), low), high))

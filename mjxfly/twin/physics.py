@@ -1,4 +1,4 @@
-"""A stand-in for the physics of a pair, without MuJoCo, and which physics a policy needs."""
+"""`StandIn`, a simple model of a pair without MuJoCo, and the choice of the model for a policy."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surr
 from mjxfly.twin.pair import RUNNING, Modes, Pair, PairState, Report, remembered
 
 CURVE = ForceCurve()
-# What the stand-in's drones report is that uncertain: no real stream repeats bit by bit. Standard deviations.
+# Standard deviations of the reported states: the flight's checks take a stream that repeats exactly for a frozen one.
 VELOCITY_NOISE, RATE_NOISE = 1e-3, 5e-3  # [m/s], [rad/s]
-FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
+FASTEST = 30.0  # [rad/s] bound on the body rates; the second-order attitude model is not valid beyond it
 
 
 @dataclass(frozen=True)
 class StandInPlant:
-    """Numbers of the stand-in."""
+    """Parameters of `StandIn`."""
 
-    mass: float = 0.07  # of all [kg]
+    mass: float = 0.07  # total [kg]
     mounts: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.0, -0.15, 0.0), (0.0, 0.15, 0.0))  # [m]
     inertia: float = 1.5e-3  # about the axes across the stick [kg m2]
-    frequency: float = 9.0  # of the attitude with both drones' motors on [rad/s]
-    damping: float = 0.9  # ratio
+    frequency: float = 9.0  # natural frequency of the attitude with both drones' motors on [rad/s]
+    damping: float = 0.9  # its damping ratio
     motor_lag: float = 0.05  # [s]
     curve: ForceCurve = CURVE
     gravity: float = 9.81  # [m/s2]
@@ -42,7 +42,7 @@ class StandInPlant:
 
 
 class StandIn:
-    """See `Pair`."""
+    """Implements `Pair` by one rigid body with second-order attitude dynamics, thrust lag and batteries."""
 
     cg_offset = math.nan
     rotor_force = np.zeros((2, 4))  # not modelled
@@ -69,26 +69,26 @@ class StandIn:
         return self._state(np.zeros(3), np.zeros(3))
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
-        """The stand-in has no gains."""
+        """Do nothing: the model has no gains."""
 
     def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
-        """The stand-in has no estimator, but says what came."""
+        """Report the pose; there is no estimator that could use it."""
         self._poses[drone] = remembered(self._poses[drone], position, quaternion)
 
     def disturb(self, drone: int, what: str, value: float) -> None:
-        """Of the faults, the stand-in knows the battery's."""
+        """See `Pair.disturb`; only "battery" has an effect."""
         if what == "battery":
             self._charge[drone] = value
 
     def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
-        """See `Pair.advance`; a drone whose stabilizer hangs keeps its thrust and levels."""
+        """See `Pair.advance`; a drone whose stabilizer hangs keeps its thrust and levels out."""
         plant = self.plant
         held = np.array(modes.held)[:, None]
         setpoints = np.where(held, np.array([[0.0, 0.0, 0.0, thrust] for thrust in self._commands]), setpoints)
         setpoints = setpoints * np.array(modes.run)[:, None]
         self._commands = setpoints[:, 3].copy()
-        wanted = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
-        self._thrust += (wanted - self._thrust) * -np.expm1(-dt / plant.motor_lag)
+        target = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
+        self._thrust += (target - self._thrust) * -np.expm1(-dt / plant.motor_lag)
         self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
         matrix = rotations.matrix_from_quaternion(self._quaternion)
         force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
@@ -98,7 +98,7 @@ class StandIn:
         self._velocity = self._velocity + dt * force
         self._position = self._position + dt * self._velocity
         if self._position[2] <= 0:
-            force, turning = self._rest(force), np.zeros(3)
+            force, turning = self._touch_ground(force), np.zeros(3)
         return self._state(force, turning)
 
     def _turning(self, setpoints: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -117,8 +117,8 @@ class StandIn:
         turning[:2] += moment / plant.inertia
         return turning
 
-    def _rest(self, force: np.ndarray) -> np.ndarray:
-        """The ground stops everything and levels the stick; it pushes but does not pull."""
+    def _touch_ground(self, force: np.ndarray) -> np.ndarray:
+        """Ground contact: stop the pair and level the stick; return the acceleration (3,), 0 unless it lifts off."""
         lifting = force[2] > 0
         self._position = np.append(self._position[:2], 0.0)
         self._velocity = np.array([0.0, 0.0, max(self._velocity[2], 0.0) if lifting else 0.0])
@@ -130,20 +130,20 @@ class StandIn:
         return force if lifting else np.zeros(3)
 
     def _state(self, acceleration: np.ndarray, turning: np.ndarray) -> PairState:
-        """With O at `acceleration` (3,) in the world [m/s2], the pair `turning` (3,) in body axes [rad/s2]."""
+        """Return the state; O's `acceleration` (3,) in the world [m/s2], angular one `turning` (3,), body [rad/s2]."""
         plant, matrix = self.plant, rotations.matrix_from_quaternion(self._quaternion)
         arms = self._mounts @ matrix.T
         swing = rotations.cross(self._rates, self._mounts) @ matrix.T
         load = self._thrust / plant.curve.force(65535)
-        circling = rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
-        felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
-        force = felt + rotations.cross(turning, self._mounts) + circling
+        centripetal = rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
+        at_origin = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        force = at_origin + rotations.cross(turning, self._mounts) + centripetal
         battery = self._charge - plant.sag * load
         pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
         position, velocity = self._position + arms, self._velocity + swing
         quaternion, rates = (np.stack([one] * 2) for one in (self._quaternion, self._rates))
         noise = self._random.standard_normal((2, 2, 3))
-        seen = velocity + VELOCITY_NOISE * noise[0], quaternion, rates + RATE_NOISE * noise[1]
+        reported = velocity + VELOCITY_NOISE * noise[0], quaternion, rates + RATE_NOISE * noise[1]
         drive = pwm, pwm, self._commands
         return PairState(
             position=position,
@@ -152,14 +152,14 @@ class StandIn:
             rates=rates,
             specific_force=force,
             battery=battery,
-            report=Report(position, *seen, force, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
+            report=Report(position, *reported, force, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
         )
 
 
 def make_pair(
     card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, surroundings: Surroundings = QUIET
 ) -> Pair:
-    """Physics of the rig that a policy's `card` describes; without one, the stand-in's own rig."""
+    """Return the physics of the rig in a policy's metadata `card`; without it, the default `StandIn`."""
     return (
         StandIn(kind=kind, surroundings=surroundings) if card is None else pair_of(config_of(card), kind, surroundings)
     )
@@ -171,9 +171,9 @@ def pair_of(
     surroundings: Surroundings = QUIET,
     conditions: Conditions | None = None,
 ) -> Pair:
-    """Physics of the rig of `config`; whatever is heavy is imported here, not above.
+    """Return the physics of the rig of `config`: `CoupledPair` for Crazyflies, else `StandIn`.
 
-    Raises InputError if the coupled model is needed and MuJoCo is not installed.
+    MuJoCo is imported only if needed. Raises InputError if it is not installed.
     """
     if not is_crazyflie(config):
         leader, follower = config.plant.pair

@@ -1,6 +1,6 @@
-"""One drone's end of the CRTP protocol: a datagram in, datagrams out. No socket, no clock, no physics.
+"""CRTP protocol of one drone: maps a received datagram to answers, without sockets, clock and physics.
 
-Any bytes may come in; what makes no sense is dropped, as the firmware drops it.
+Any bytes may arrive. Invalid datagrams are dropped, as by the firmware.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ MAX_DATA = 30
 GREETING = b"Bitcraze Crazyflie".ljust(30, b"\0")
 PARAM, COMMANDER, MEMORY, LOG, LOCALIZATION, GENERIC, SUPERVISOR = 2, 3, 4, 5, 6, 7, 9
 PLATFORM, LINK = 13, 15
-ADDRESS = 0xE7  # last byte of the radio's, by which packed poses are told apart
+ADDRESS = 0xE7  # last byte of the radio's address, which identifies the drone in packed poses
 EMERGENCY, KEEPALIVE, POSE, POSES = 3, 4, 8, 9  # kinds of generic localization packets
 Pose = Callable[[np.ndarray, "np.ndarray | None"], None]
 
 
 def header(port: int, channel: int) -> int:
-    """First byte of a packet."""
+    """Return the first byte of a packet."""
     return port << 4 | 0x0C | channel
 
 
@@ -54,21 +54,21 @@ class Peer:
         app: App | None = None,
         decks: Mapping[str, float] | None = None,
     ):
-        """`app`: what runs beside it; `decks`: parameters whose values after boot are those of its decks."""
+        """`on_parameter` and `on_pose` handle writes and poses; `decks`: values after boot that decks change."""
         self.firmware, self._app = firmware, app
         self.values = Values(firmware.kind, on_parameter, decks, None if app is None else app.parameters)
         self.parameters = self.values.listed
         parameters = [item(one.type_byte, one.name) for one in self.parameters]
-        known = LOG_VARIABLES + (() if app is None else OF_APP)
-        variables = [item(LOG_TYPES[kind][0], name) for name, kind in known]
-        self.logs = Blocks(known)
+        listed = LOG_VARIABLES + (() if app is None else OF_APP)
+        variables = [item(LOG_TYPES[kind][0], name) for name, kind in listed]
+        self.logs = Blocks(listed)
         self._on_pose = on_pose
         self._handlers: dict[tuple[int, int], Callable[[bytes, float], list[bytes] | None]] = {
             (LINK, 0): lambda data, now: [data],
             (LINK, 1): lambda data, now: [GREETING] if data[:1] == b"\0" else [],
             (PLATFORM, 0): self._platform,
             (PLATFORM, 1): self._version,
-            (PLATFORM, 2): self._of_app,
+            (PLATFORM, 2): self._app_channel,
             (PARAM, 0): lambda data, now: self._contents(data, parameters, b""),
             (PARAM, 1): self._read_parameter,
             (PARAM, 2): self._write_parameter,
@@ -87,7 +87,7 @@ class Peer:
         }
 
     def receive(self, datagram: bytes, now: float) -> list[bytes]:
-        """Answers to one datagram at time `now` [s]."""
+        """Return the answers to one datagram at time `now` [s]."""
         if not datagram or len(datagram) > 1 + MAX_DATA:
             return []
         if datagram[0] == 0xFF:  # a scan
@@ -99,7 +99,7 @@ class Peer:
         return [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now) or ()]
 
     def log_data(self, readings: Readings | Mapping[str, float], now: float) -> list[bytes]:
-        """The datagrams of all log blocks that are due at `now`."""
+        """Return the datagrams of all log blocks that are due at `now` [s]."""
         return [bytes([header(LOG, 2)]) + data for data in self.logs.take(readings, now)]
 
     # Handlers: payload -> payloads of the answers.
@@ -110,14 +110,14 @@ class Peer:
         return [data[:1] + answers[data[0]]] if data and data[0] in answers else []
 
     def _platform(self, data: bytes, now: float) -> list[bytes]:
-        """Arming and recovery as older programs ask for it."""
+        """Arming and recovery by the older requests."""
         supervisor = self.firmware.supervisor
         if data[:1] == b"\x01":
             done = len(data) > 1 and supervisor.request_arming(bool(data[1]))
             return [bytes([1, done, supervisor.armed])]
         return [bytes([2, supervisor.recover(), not supervisor.crashed])] if data[:1] == b"\x02" else [data]
 
-    def _of_app(self, data: bytes, now: float) -> list[bytes]:
+    def _app_channel(self, data: bytes, now: float) -> list[bytes]:
         answer = b"" if self._app is None else self._app.laptop(data, int(1000 * now))
         return [answer] if answer else []
 
@@ -134,31 +134,31 @@ class Peer:
         return self.parameters[index] if index < len(self.parameters) else None
 
     def _read_parameter(self, data: bytes, now: float) -> list[bytes]:
-        known = self._parameter(data)
-        if known is None:
+        parameter = self._parameter(data)
+        if parameter is None:
             return [data[:2] + bytes([UNKNOWN])] if len(data) >= 2 else []
-        return [data[:2] + b"\0" + known.pack(self.values[known.name])]
+        return [data[:2] + b"\0" + parameter.pack(self.values[parameter.name])]
 
     def _write_parameter(self, data: bytes, now: float) -> list[bytes]:
-        known = self._parameter(data)
-        if known is None:
+        parameter = self._parameter(data)
+        if parameter is None:
             return [data[:2] + bytes([UNKNOWN])] if len(data) >= 2 else []
-        if known.read_only:
+        if parameter.read_only:
             return []
         try:
-            value = known.unpack(data[2:])
+            value = parameter.unpack(data[2:])
         except struct.error:
             return []
-        self.values.write(known.name, value)
-        return [data[:2] + known.pack(value)]
+        self.values.write(parameter.name, value)
+        return [data[:2] + parameter.pack(value)]
 
     def _parameter_extra(self, data: bytes, now: float) -> list[bytes]:
-        known = self._parameter(data[1:3])
-        if known is None:
+        parameter = self._parameter(data[1:3])
+        if parameter is None:
             return [data[:3] + bytes([UNKNOWN])] if len(data) >= 3 else []
         if data[0] == 0x07:
-            return [data[:3] + bytes([0, int(known.persistent)])]
-        return [data[:3] + b"\0" + known.pack(self.values.defaults[known.name])] if data[0] == 0x08 else []
+            return [data[:3] + bytes([0, int(parameter.persistent)])]
+        return [data[:3] + b"\0" + parameter.pack(self.values.defaults[parameter.name])] if data[0] == 0x08 else []
 
     def _setpoint(self, data: bytes, now: float) -> None:
         if len(data) == packets.SETPOINT_SIZE:
@@ -180,28 +180,28 @@ class Peer:
         elif data[:1] == bytes([KEEPALIVE]):
             supervisor.keepalive = now
         elif data[:1] == bytes([POSE]) and len(data) >= 29:
-            x, y, z, *turned = struct.unpack("<7f", data[1:29])
-            self._pose((x, y, z), turned)
+            x, y, z, *attitude = struct.unpack("<7f", data[1:29])
+            self._pose((x, y, z), attitude)
         elif data[:1] == bytes([POSES]):
             self._packed_poses(data[1:])
 
     def _packed_poses(self, data: bytes) -> None:
-        for number, x, y, z, turned in struct.iter_unpack("<BhhhI", data[: len(data) // 11 * 11]):
+        for number, x, y, z, attitude in struct.iter_unpack("<BhhhI", data[: len(data) // 11 * 11]):
             if number == ADDRESS:
                 try:
-                    w, *vector = packets.decompress_quaternion(turned).tolist()
+                    w, *vector = packets.decompress_quaternion(attitude).tolist()
                 except PacketError:
                     continue
                 self._pose([x / 1000, y / 1000, z / 1000], [*vector, w])
 
-    def _pose(self, position: object, turned: object = None) -> None:
-        """Hand on a pose, `turned` as (x, y, z, w); the twin drops what would make its filter not finite."""
-        place = np.array(position, float)
-        quaternion = None if turned is None else np.roll(np.array(turned, float), 1)
-        if not np.isfinite(place).all() or (quaternion is not None and not np.isfinite(quaternion).all()):
+    def _pose(self, position: object, attitude: object = None) -> None:
+        """Pass on a pose, `attitude` as (x, y, z, w). Poses that would make the filter not finite are dropped."""
+        point = np.array(position, float)
+        quaternion = None if attitude is None else np.roll(np.array(attitude, float), 1)
+        if not np.isfinite(point).all() or (quaternion is not None and not np.isfinite(quaternion).all()):
             return
         if quaternion is None or 0.5 < float(quaternion @ quaternion) < 2.0:
-            self._on_pose(place, quaternion)
+            self._on_pose(point, quaternion)
 
     def _info(self, data: bytes, now: float) -> list[bytes]:
         info = self.firmware.info

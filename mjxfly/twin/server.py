@@ -1,4 +1,4 @@
-"""The twin in real time: one thread, two UDP sockets on loopback, physics in between."""
+"""The twin in real time: one thread that serves two UDP sockets on the loopback and steps the physics."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from mjxfly.twin.pair import Pair, PairState
 
 HOST = "127.0.0.1"
 PERIOD = 0.005  # of physics, firmware and sockets [s]
-MOST_BEHIND = 0.5  # [s] that a twin makes good which was held up; the runner thinks it lost after 0.1 s
+MOST_BEHIND = 0.5  # [s] largest delay that the twin catches up with; the runner takes it for lost after 0.1 s
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What really happens at one moment, whatever the link says."""
+    """True state of the twin at one time."""
 
     time: float  # [s] of the twin
     state: PairState
-    thrust: tuple[int, int]  # [thrust units] that reach the controllers
+    thrust: tuple[int, int]  # inputs of the controllers [thrust units]
     pwm: np.ndarray  # (2, 4) of all motors
     last_wire_thrust: tuple[int, int]  # [thrust units] of the last setpoint received
     info: tuple[int, int]
@@ -37,9 +37,9 @@ class Twin:
     """Two drones that answer at `uris`. A context manager; `inject` works while it runs."""
 
     def __init__(self, pair: Pair, ports: tuple[int, int] = (0, 0), cores: tuple[Library, Library] | None = None):
-        """`ports` of leader and follower, 0: any free one; `cores`: the apps on board, see `app.host`."""
+        """`ports` of leader and follower, 0 for a free one; `cores`: compiled apps on board, see `app.host`."""
         self._pair, self._state = pair, pair.start()
-        self.start = self._state  # how the pair stands
+        self.start = self._state  # initial state
         one, other = cores or (None, None)
         self.drones = TwinDrone(pair, 0, one), TwinDrone(pair, 1, other)
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in ports]
@@ -56,10 +56,10 @@ class Twin:
         self._lock = threading.Lock()
         self._begun = clock.now()
         self._thread = threading.Thread(target=self._run, name="twin", daemon=True)
-        self.truth = self._seen(0.0)
-        self.history: list[Truth] = []  # one in ten steps
+        self.truth = self._truth_at(0.0)
+        self.history: list[Truth] = []  # every tenth step
         self.failure: BaseException | None = None
-        self.behind = self.most_behind = 0.0  # real time, now and ever [s]
+        self.behind = self.most_behind = 0.0  # delay to real time, now and largest [s]
 
     def __enter__(self) -> Twin:
         self._thread.start()
@@ -77,7 +77,7 @@ class Twin:
         return bool(self.truth.pwm.max() > 0)
 
     def inject(self, one: Injection) -> None:
-        """Have a fault come to pass now."""
+        """Inject a fault now."""
         with self._lock:
             if one.what == "port":  # the radio task ends while the motors run on: the laptop's datagrams are refused
                 self._closed[one.drone] = True
@@ -87,7 +87,7 @@ class Twin:
     def _run(self) -> None:
         try:
             self._loop()
-        except BaseException as failure:  # for tests, which look at what ended the twin
+        except BaseException as failure:  # kept for the reader of `failure`, in another thread
             self.failure = failure
             raise
 
@@ -96,7 +96,7 @@ class Twin:
         return clock.now() - self._begun
 
     def _loop(self) -> None:
-        """Until it is left, or cannot keep up: one that stood still meanwhile would have the runner blame its links."""
+        """Step until `__exit__`, or until the twin is too late: the runner would report the delay as a link fault."""
         self._begun = clock.now()
         step = 0
         while not self._stop.is_set():
@@ -118,9 +118,9 @@ class Twin:
                 self.history.append(self.truth)
 
     def _wait(self, seconds: float) -> None:
-        """Sleep until something is due, or until a datagram comes; it is handled at once.
+        """Sleep for at most `seconds`, or until a datagram arrives, and handle it at once.
 
-        Requests are answered between the steps: a table of contents is a hundred of them, one after the other.
+        Requests are answered between the steps, since a table of contents takes a hundred requests in sequence.
         """
         alive = [n for n in range(2) if not self._closed[n]]
         try:
@@ -129,7 +129,7 @@ class Twin:
         except (OSError, ValueError):
             if not any(self._closed[n] for n in alive):
                 raise
-            return  # a port was closed just now
+            return  # `inject` closed a port meanwhile
         with self._lock:
             for number in alive:
                 if self._sockets[number] in readable:
@@ -138,7 +138,7 @@ class Twin:
                 self._transmit(number, self.drones[number].transmit(self._now()))
 
     def _receive(self, number: int, now: float) -> None:
-        """Take all that has come. It came at `now` [s], to a twin that is late at the time of its step."""
+        """Read at most 50 waiting datagrams; their arrival time is `now` [s], for a late twin that of its step."""
         for _ in range(50):
             if self._closed[number]:
                 return
@@ -151,7 +151,7 @@ class Twin:
 
     def _step(self, now: float) -> None:
         self._state = advance(self._pair, self.drones, self._state, now, PERIOD)
-        self.truth = self._seen(now)
+        self.truth = self._truth_at(now)
         for number, drone in enumerate(self.drones):
             self._transmit(number, drone.send(now))
 
@@ -162,10 +162,10 @@ class Twin:
         for datagram in datagrams:
             try:
                 self._sockets[number].sendto(datagram, client)
-            except OSError:  # no one listens any more, or the buffer is full: the radio forgets it too
+            except OSError:  # no receiver, or the buffer is full: the datagram is lost, as by radio
                 return
 
-    def _seen(self, now: float) -> Truth:
+    def _truth_at(self, now: float) -> Truth:
         one, other = (drone.firmware for drone in self.drones)
         thrust = one.order.setpoint.thrust, other.order.setpoint.thrust
         last = one.commander.wire_thrust, other.commander.wire_thrust

@@ -1,8 +1,8 @@
 """Flights in virtual time: the runner's `Flight` on the twin's drones, without sockets, processes and clock.
 
-For tests and for benchmarks of hundreds of flights: a second of flight takes about a quarter of a second. What a real
-connection does before a flight, gains, estimator reset and time for it, is done here by packets to the drones' own
-protocol; the link's delay holds for setpoints and states alike.
+For tests and benchmarks of hundreds of flights: a second of flight takes about a quarter of a second. The preparation
+of a real flight (gains, reset of the estimators, waiting) is done by packets to the drones' protocol. The link's delay
+applies to setpoints and states.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from mjxfly.twin.physics import pair_of
 from mjxfly.twin.protocol import header
 
 STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
-GROUNDED = 3e-3  # [m] above its rest below which the pair has touched down
-BLOCK, HEALTH_BLOCK, APP_BLOCK, SENSED_BLOCK = 1, 2, 3, 4  # log blocks of state, health, app, what is sensed
+GROUNDED = 3e-3  # [m] largest height above rest that counts as touched down
+BLOCK, HEALTH_BLOCK, APP_BLOCK, SENSED_BLOCK = 1, 2, 3, 4  # ids of the log blocks; BLOCK: state
 HEALTH = (*packets.VARIANCES, *packets.MOTORS[0], packets.ACTING_THRUST)
 _HEALTH, _SENSED = struct.Struct("<3f4Hf"), struct.Struct("<3e3f4e")
 
 
 class VirtualLink:
-    """In the place of `link.Link`: packets go straight to a drone of the twin."""
+    """Substitute for `link.Link` that passes packets directly to a drone of the twin."""
 
     def __init__(self, drone: TwinDrone, clock: Callable[[], float], name: str, note: Note):
         self.drone, self._clock = drone, clock
@@ -64,11 +64,11 @@ class VirtualLink:
     command = pose = send
 
     def stuck_for(self, now: float) -> float:
-        """How long nothing could be sent [s]: `stuck` now, as a test says."""
+        """Time for which nothing could be sent [s]; tests set it by `stuck`."""
         return max(self.stuck - (self._clock() - now), 0.0)
 
     def ask(self, port: int, channel: int, data: bytes) -> list[bytes]:
-        """Answers to a request, without any delay or loss."""
+        """Return the answers to a request, without delay and loss."""
         return self.drone.peer.receive(bytes([header(port, channel)]) + data, self._clock())
 
     def write_parameters(self, values: Mapping[str, float]) -> None:
@@ -82,7 +82,7 @@ class VirtualLink:
     write_later = write_parameters
 
     def start_states(self) -> None:
-        """Have the state logged at 100 Hz, what is sensed at 50 Hz, and health at 20 Hz."""
+        """Start the log blocks: state at 100 Hz, sensors and app at 50 Hz, health at 20 Hz."""
         names = [name for name, _ in logs.KNOWN]
         blocks = [(BLOCK, packets.STATE_VARIABLES, 1), (HEALTH_BLOCK, HEALTH, 5), (SENSED_BLOCK, packets.SENSED, 2)]
         blocks += [(APP_BLOCK, APP_VARIABLES, 2)] if self.drone.app is not None else []
@@ -96,7 +96,7 @@ class VirtualLink:
             self.ask(5, 1, bytes([3, block, period]))
 
     def take(self, datagram: bytes, now: float) -> None:
-        """A datagram came from the drone."""
+        """Handle a datagram of the drone at `now` [s]."""
         logged = datagram[:1] == bytes([header(5, 2)])
         if logged and len(datagram) == 5 + _HEALTH.size and datagram[1] == HEALTH_BLOCK:
             values = zip((name for name, _ in HEALTH), _HEALTH.unpack(datagram[5:]), strict=True)
@@ -104,8 +104,9 @@ class VirtualLink:
             self._note("health", t=now, drone=self.name, **health._asdict())
             self.telemetry.health = HealthSample(health, now)
         elif logged and len(datagram) == 5 + _SENSED.size and datagram[1] == SENSED_BLOCK:
-            seen = zip((name for name, _ in packets.SENSED), _SENSED.unpack(datagram[5:]), strict=True)
-            self.telemetry.sensed = SensedSample(packets.sensed_of(dict(seen)), int.from_bytes(datagram[2:5], "little"))
+            values = zip((name for name, _ in packets.SENSED), _SENSED.unpack(datagram[5:]), strict=True)
+            stamp = int.from_bytes(datagram[2:5], "little")
+            self.telemetry.sensed = SensedSample(packets.sensed_of(dict(values)), stamp)
         elif logged and len(datagram) == 5 + len(APP_VARIABLES) and datagram[1] == APP_BLOCK:
             self.telemetry.app = sample_of(
                 dict(zip((name for name, _ in APP_VARIABLES), datagram[5:], strict=True)), now
@@ -121,24 +122,24 @@ class VirtualLink:
 
 
 class MemoryLog:
-    """In the place of the flight log; with `keep` ticks, states and health as well."""
+    """Substitute for the flight log, in memory; with `keep`, ticks, states and health are kept as well."""
 
     def __init__(self, keep: bool = True) -> None:
         self.records: list[dict[str, Any]] = []
         self._keep = keep
 
     def note(self, kind: str, t: float | None = None, **fields: Any) -> None:
-        """Keep one record."""
+        """Append one record."""
         if self._keep or kind not in ("tick", "state", "health"):
             self.records.append({"kind": kind, "t": t, **fields})
 
     def transitions(self) -> list[str]:
-        """States of the flight's supervisor in order."""
+        """Return the states that the flight's supervisor has entered, in order."""
         return [record["after"] for record in self.records if record["kind"] == "transition"]
 
 
 class Moment(NamedTuple):
-    """The truth at one moment."""
+    """True state at one time."""
 
     time: float  # [s]
     state: str  # of the flight's supervisor
@@ -152,7 +153,7 @@ class Moment(NamedTuple):
 
 
 class VirtualTwin:
-    """A pair, its two drones, and flights of them one after the other."""
+    """A pair, its two drones, and consecutive flights with them."""
 
     def __init__(
         self,
@@ -171,9 +172,9 @@ class VirtualTwin:
     ):
         """Put the pair on the ground and begin a flight, `settle` [s] after the states have started.
 
-        Without `physics` it is that of the policy's card, without `maps` the card's by force curve. `log` is what
-        `MemoryLog` is, or a `flight_log.Journal`. With `checks` a drone that cannot fly refuses the flight, as the
-        check before a real one does. `cores`: apps of both drones, which then fly; see `app.host`.
+        `physics` and `maps` (by force curve) default to those of the policy's metadata. `log`: a `MemoryLog` or a
+        `flight_log.Journal`. With `checks`, a drone that cannot fly refuses the flight, as before a real flight.
+        `cores`: compiled apps of both drones, which then control the flight, see `app.host`.
         """
         self.policy, self.rig, self._checks = policy, Rig.of_card(policy.card), checks
         self.config = Controller(policy).config
@@ -201,7 +202,7 @@ class VirtualTwin:
         self._start_flight(settle)
 
     def _start_flight(self, settle: float) -> None:
-        """Prepare the drones, wait `settle` [s], and begin a flight as one whose checks have passed, if they would."""
+        """Prepare the drones, wait `settle` [s], begin a flight; with `checks` it is ready only if both can fly."""
         curve: CurveName = "linear" if "linear" in self.variants[0] else "older"
         controller, curves = Controller(self.policy), [curve, curve]
         kind = app_flight.OnboardFlight if self._onboard else Flight
@@ -213,16 +214,16 @@ class VirtualTwin:
             link.start_states()
         self.advance(max(settle, 4 * STEP) + 2 * self.pair.surroundings.delay)
         infos = [drone.firmware.info for drone in self.drones]
-        can = [info & (packets.CAN_ARM | packets.CAN_FLY) and not down_reason(info, armed=False) for info in infos]
-        unfit = [name for name, able in zip(NAMES, can, strict=True) if not able]
+        able = [info & (packets.CAN_ARM | packets.CAN_FLY) and not down_reason(info, armed=False) for info in infos]
+        unfit = [name for name, can_fly in zip(NAMES, able, strict=True) if not can_fly]
         self.flight.ready = not (unfit and self._checks)
         self.flight.refusal = f"{unfit[0]} cannot fly" if unfit else ""
         self.flight.begin(self.now)
 
     def start_in_air(self, start: Any) -> None:
-        """Have the flight begin under both laws, from a simulation's `PlantState` of one world, its motors running.
+        """Begin the flight in the air under both controllers, from a simulation's `PlantState` (no batch).
 
-        Only the coupled pair can be put there. Height and position are those above the place where the pair rests.
+        Only `CoupledPair` supports it. The position is relative to that at rest.
         """
         late = 2 * self.pair.surroundings.delay
         self.advance(2 * PERIOD)
@@ -235,16 +236,16 @@ class VirtualTwin:
         self.flight.supervisor = Supervisor(State.FLY, self.now)
 
     def next_flight(self, pause: float = 3.0, settle: float = 1.0) -> Flight:
-        """A further flight of the same drones without reboot, after `pause` [s] of a silent link.
+        """Begin another flight of the same drones without reboot, after `pause` [s] of a silent link.
 
-        In between the laptop disconnects, connects anew and prepares the drones, which takes `settle` [s].
+        The laptop then connects again and prepares the drones, which takes `settle` [s].
         """
         self.advance(pause)
         self._start_flight(settle)
         return self.flight
 
     def advance(self, seconds: float) -> None:
-        """Let the twin live on for `seconds`."""
+        """Step the twin for `seconds` without the flight."""
         for _ in range(round(seconds / STEP)):
             self._count += 1
             self.now = self._count * STEP
@@ -254,34 +255,34 @@ class VirtualTwin:
                     link.take(datagram, self.now)
 
     def tick(self) -> bool:
-        """One period of twin and flight; false once the flight is done."""
+        """Run one period of twin and flight; return false once the flight has ended."""
         self.advance(self.flight.settings.period)
         going = self.flight.tick(self.now)
         self.track.append(self.moment())
         return going
 
     def run(self, limit: float = 120.0) -> str:
-        """Tick to the end of the flight, at most `limit` [s]; the last state of its supervisor."""
+        """Tick to the end of the flight, for at most `limit` [s]; return the last state of its supervisor."""
         self.fly_for(limit)
         return self.flight.supervisor.state.value
 
     def fly_until(self, wanted: State, limit: float = 30.0) -> None:
-        """Tick until the supervisor is in `wanted`; AssertionError after `limit` seconds."""
+        """Tick until the supervisor is in the state `wanted`. Raises AssertionError after `limit` [s]."""
         end = self.now + limit
         while self.flight.supervisor.state is not wanted:
             assert self.now < end, f"still in {self.flight.supervisor} after {limit} s"
             assert self.tick() or self.flight.supervisor.state is wanted
 
     def fly_for(self, seconds: float) -> None:
-        """Tick for `seconds`, or until the flight is done."""
+        """Tick for `seconds`, or until the flight has ended."""
         end = self.now + seconds
         while self.now < end and self.tick():
             pass
 
-    # The truth.
+    # True state.
 
     def moment(self) -> Moment:
-        """The truth, now."""
+        """Return the true state now."""
         state = self.state
         line = state.position[0] - state.position[1]
         return Moment(
@@ -297,11 +298,11 @@ class VirtualTwin:
         )
 
     def running(self) -> list[bool]:
-        """Whose motors turn."""
+        """Whether any motor turns, of leader and follower."""
         return [bool(row.max() > 0) for row in self.state.report.pwm]
 
     def touchdown_speed(self) -> float:
-        """Downward speed [m/s] at the first contact after the highest point of the recorded track; nan: none."""
+        """Return the downward speed [m/s] at the first contact after the highest point of `track`, NaN without one."""
         heights = np.array([moment.position[2] for moment in self.track]) - self.rest
         if not len(heights) or heights.max() < 0.02:
             return math.nan
@@ -315,9 +316,9 @@ class VirtualTwin:
     # Faults.
 
     def fault_drone(self, number: int, **faults: Any) -> None:
-        """Switch `DroneFaults` of one drone on."""
+        """Set fields of one drone's `DroneFaults`."""
         self.drones[number].faults = dataclasses.replace(self.drones[number].faults, **faults)
 
     def fault_link(self, number: int, **faults: Any) -> None:
-        """Switch `LinkFaults` of one drone on."""
+        """Set fields of one drone's `LinkFaults`."""
         self.drones[number].link = dataclasses.replace(self.drones[number].link, **faults)

@@ -1,1 +1,1 @@
-"""A flight in the browser while it is flown, and after: `python -m mjxfly.view LOG`."""
+"""Viewer of flight logs in the browser, during the flight or afterwards: `python -m mjxfly.view LOG`."""

@@ -1,7 +1,7 @@
-"""The live view for Foxglove: what is added to a flight log, as messages of ROS 2 on a WebSocket of this machine.
+"""Live view for Foxglove: a WebSocket server on the loopback that sends new log records as ROS 2 messages.
 
-The protocol is version 1 of Foxglove's SDK. A WebSocket of this machine can be opened by every page that its browser
-shows, wherever it is from, so that the origin decides who is answered; Foxglove's own server does not look at it.
+The protocol is version 1 of Foxglove's SDK. Any web page open in a browser of this machine can connect to a loopback
+WebSocket, so the server checks the request's origin. Foxglove's server does not, which is why it is not used.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from mjxfly.process import bounded
 
 HOST = "127.0.0.1"
 PROTOCOL: Any = "foxglove.sdk.v1"
-DATA = struct.Struct("<BIQ")  # before a message's bytes: 1, subscription, time [ns]
-BACKLOG = 1024  # messages that wait for one client; whoever is slower misses the oldest
-LARGEST = 2**16  # bytes that a client may say at once
-FAREWELL = 1.0  # [s] that a client has for closing the connection when the flight has ended
-OWN = (HOST, "localhost")
+DATA = struct.Struct("<BIQ")  # header of a message: opcode 1, subscription, time [ns]
+BACKLOG = 1024  # messages queued for one client; a slower client loses the oldest
+LARGEST_REQUEST = 2**16  # [bytes]
+CLOSE_TIMEOUT = 1.0  # [s] for the closing handshake of one client
+LOOPBACK = (HOST, "localhost")
 FOXGLOVE = "https://app.foxglove.dev"
 
 
 class Foxglove:
-    """Serves the messages of a flight log. A context manager."""
+    """Server of the messages of a flight log. A context manager."""
 
     def __init__(self, port: int):
-        """Listen on `port` of the loopback, 0 for a free one. Raises InputError if that cannot be had."""
+        """Listen on `port` of the loopback, 0 for a free one. Raises InputError if it cannot be opened."""
         from websockets.sync.server import serve
 
         self._encoder = Encoder(self)
@@ -47,13 +47,13 @@ class Foxglove:
         self._clients: list[_Client] = []
         try:
             self._server = serve(
-                self._attend,
+                self._serve_client,
                 HOST,
                 port,
                 subprotocols=[PROTOCOL],
                 process_request=_check,
-                max_size=LARGEST,
-                logger=logging.Logger("foxglove", logging.CRITICAL + 1),  # a client that is refused is no news
+                max_size=LARGEST_REQUEST,
+                logger=logging.Logger("foxglove", logging.CRITICAL + 1),  # silent: refused clients are not logged
             )
         except OSError as error:
             why = error.strerror or error
@@ -72,69 +72,69 @@ class Foxglove:
 
     @property
     def address(self) -> str:
-        """For Foxglove's Open connection."""
+        """The URL for Foxglove's "Open connection"."""
         return f"ws://{HOST}:{self._server.socket.getsockname()[1]}"
 
     def take(self, record: Record) -> None:
-        """Send what one `record` says, the header first."""
+        """Send one `record` as messages; the first record must be the header."""
         self._encoder.take(record)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """A further type of messages; its number."""
+        """Add a message type; returns its number."""
         self._schemas.append({"schemaName": name, "schemaEncoding": encoding, "schema": data.decode()})
         return len(self._schemas)
 
     def register_channel(self, topic: str, message_encoding: str, schema_id: int) -> int:
-        """A further topic with messages of the type `schema_id`; its number."""
+        """Add a topic with messages of the type `schema_id` and advertise it; returns its number."""
         with self._lock:
             number = len(self._channels) + 1
             channel = {"id": number, "topic": topic, "encoding": message_encoding, **self._schemas[schema_id - 1]}
             self._channels.append(channel)
             for client in self._clients:
-                client.tell(json.dumps({"op": "advertise", "channels": [channel]}))
+                client.enqueue(json.dumps({"op": "advertise", "channels": [channel]}))
         return number
 
     def add_message(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
-        """A message [ns] on the topic `channel_id`."""
+        """Queue a message of the topic `channel_id` for its subscribers; times in [ns]."""
         with self._lock:
             for client in self._clients:
-                for subscription, channel in client.wanted.items():
+                for subscription, channel in client.subscriptions.items():
                     if channel == channel_id:
-                        client.tell(DATA.pack(1, subscription, log_time) + data)
+                        client.enqueue(DATA.pack(1, subscription, log_time) + data)
 
-    def _attend(self, plug: Any) -> None:
-        """One client, in a thread of its own, until it leaves or says what is none of the protocol."""
-        client = _Client(plug)
+    def _serve_client(self, connection: Any) -> None:
+        """Serve one connection in its thread, until the client leaves or violates the protocol."""
+        client = _Client(connection)
         with self._lock:
-            client.tell(json.dumps({"op": "serverInfo", "name": "mjxball", "capabilities": [], "metadata": {}}))
-            client.tell(json.dumps({"op": "advertise", "channels": self._channels}))
+            client.enqueue(json.dumps({"op": "serverInfo", "name": "mjxball", "capabilities": [], "metadata": {}}))
+            client.enqueue(json.dumps({"op": "advertise", "channels": self._channels}))
             self._clients.append(client)
         sending = threading.Thread(target=client.send, daemon=True)
         sending.start()
         try:
-            for text in plug:
-                wanted = _subscriptions(text, client.wanted)
+            for text in connection:
+                subscriptions = _subscriptions(text, client.subscriptions)
                 with self._lock:
-                    client.wanted = wanted
+                    client.subscriptions = subscriptions
         except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
-            plug.close(1002)
+            connection.close(1002)
         finally:
             with self._lock:
                 self._clients.remove(client)
-            client.tell(None)
+            client.enqueue(None)
 
 
 class _Client:
-    """What waits for one client, and what it has subscribed to."""
+    """Message queue and subscriptions of one client."""
 
-    def __init__(self, plug: Any):
-        self.wanted: dict[int, int] = {}  # channel by the number of its subscription
-        self._plug = plug
+    def __init__(self, connection: Any):
+        self.subscriptions: dict[int, int] = {}  # subscription number -> channel number
+        self._connection = connection
         self._waiting: collections.deque[str | bytes | None] = collections.deque()
         self._news = threading.Condition()
 
-    def tell(self, message: str | bytes | None) -> None:
-        """Send `message`, later; None is the last. Of too many the oldest data are left out, and no text is."""
+    def enqueue(self, message: str | bytes | None) -> None:
+        """Queue `message`; None ends the queue. A full queue drops its oldest binary message, never a text message."""
         with self._news:
             data = (place for place, one in enumerate(self._waiting) if isinstance(one, bytes))
             if len(self._waiting) >= BACKLOG and (oldest := next(data, None)) is not None:
@@ -143,18 +143,18 @@ class _Client:
             self._news.notify()
 
     def close(self) -> None:
-        """Part from the client; one that does not read would hold that up for ever, and is cut off."""
-        if not bounded(self._plug.close, FAREWELL):
+        """Close the connection; after a timeout, shut the socket of a client that does not answer."""
+        if not bounded(self._connection.close, CLOSE_TIMEOUT):
             with contextlib.suppress(OSError):
-                self._plug.socket.shutdown(socket.SHUT_RDWR)
+                self._connection.socket.shutdown(socket.SHUT_RDWR)
 
     def send(self) -> None:
-        """Send what waits, to the last."""
+        """Send the queued messages until the final None."""
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):
             while (message := self._next()) is not None:
-                self._plug.send(message)
+                self._connection.send(message)
 
     def _next(self) -> str | bytes | None:
         with self._news:
@@ -162,29 +162,30 @@ class _Client:
             return self._waiting.popleft()
 
 
-def _check(plug: Any, request: Any) -> Any:
-    """An answer that refuses `request`; None if it is of a program of this machine, its pages or Foxglove's."""
+def _check(connection: Any, request: Any) -> Any:
+    """Return None for a `request` of a local program, a page of this machine or Foxglove's, else a refusal."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-    # A page of elsewhere whose name was made to lead here carries that name.
-    if len(hosts) != 1 or urlsplit(f"//{hosts[0]}").hostname not in OWN or not all(map(_is_allowed, origins)):
-        return plug.respond(http.HTTPStatus.FORBIDDEN, "this server is for this machine alone\n")
+    # DNS rebinding: a foreign name that resolves to the loopback appears as the host.
+    if len(hosts) != 1 or urlsplit(f"//{hosts[0]}").hostname not in LOOPBACK or not all(map(_is_allowed, origins)):
+        return connection.respond(http.HTTPStatus.FORBIDDEN, "this server is for this machine alone\n")
     return None
 
 
 def _is_allowed(origin: str) -> bool:
-    """Whether a page of that `origin` may listen: Foxglove's and this machine's own, and what is no page of the web."""
-    found = urlsplit(origin)
-    return origin == FOXGLOVE or found.scheme == "file" or (found.scheme in ("http", "https") and found.hostname in OWN)
+    """Whether pages of `origin` may connect: Foxglove's, those of this machine's servers, and local files."""
+    url = urlsplit(origin)
+    local = url.scheme in ("http", "https") and url.hostname in LOOPBACK
+    return origin == FOXGLOVE or url.scheme == "file" or local
 
 
-def _subscriptions(text: str | bytes, wanted: dict[int, int]) -> dict[int, int]:
-    """`wanted` after the client said `text`, which changes nothing if it is about anything else. Raises ValueError."""
-    told = parse_json(text) if isinstance(text, str) else {}
-    if told.get("op") == "subscribe":
-        added = {one["id"]: one["channelId"] for one in told["subscriptions"]}
+def _subscriptions(text: str | bytes, current: dict[int, int]) -> dict[int, int]:
+    """Return the subscriptions `current` as changed by the client's message `text`. Raises ValueError."""
+    request = parse_json(text) if isinstance(text, str) else {}
+    if request.get("op") == "subscribe":
+        added = {one["id"]: one["channelId"] for one in request["subscriptions"]}
         if not all(type(number) is int and 0 <= number < 2**32 for number in added):
             raise ValueError("a number of 32 bits")
-        return wanted | added
-    if told.get("op") == "unsubscribe":
-        return {number: channel for number, channel in wanted.items() if number not in told["subscriptionIds"]}
-    return wanted
+        return current | added
+    if request.get("op") == "unsubscribe":
+        return {number: channel for number, channel in current.items() if number not in request["subscriptionIds"]}
+    return current

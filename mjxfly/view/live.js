@@ -1,4 +1,4 @@
-// A flight that is being flown: asks the server for new rows, and stays at the newest until somebody looks back.
+// Player of a live flight. It follows the newest row until the user seeks back.
 class LivePlayer extends Player {
   grow(answer) {
     const there = this.now >= this.last && !this.playing;
@@ -22,7 +22,7 @@ class Live {
     this.ask();
   }
 
-  tell(text, level) {
+  setStatus(text, level) {
     this.status.textContent = text;
     this.status.className = level;
   }
@@ -32,18 +32,18 @@ class Live {
     let answer;
     try {
       const found = await fetch(`rows?token=${this.token}&after=${this.rows}`);
-      if (found.status === 409) { location.reload(); return; }  // another viewer, another flight
+      if (found.status === 409) { location.reload(); return; }  // the token is that of an earlier server
       if (!found.ok) throw new Error(found.statusText);
       answer = await found.json();
     } catch {
-      this.tell('the viewer has ended; what it showed is still here', 'bad');
+      this.setStatus('the viewer has ended; what it showed is still here', 'bad');
       setTimeout(() => this.ask(), 1000);
       return;
     }
-    this.tell(answer.text, answer.level);
+    this.setStatus(answer.text, answer.level);
     this.take(answer);
     if (answer.ended && this.rows === answer.total) return;
-    // A slow browser asks less often: most of its time is its own.
+    // A slow browser polls less often: handling answers takes at most a third of its time.
     const spent = performance.now() - begun;
     setTimeout(() => this.ask(), this.rows < answer.total ? 0 : Math.max(100, 2 * spent));
   }

@@ -1,4 +1,4 @@
-"""The live view: a process of its own follows a flight log and serves a page of it, to this machine alone."""
+"""Live view: an HTTP server on the loopback whose page follows a flight log that is being written."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from mjxfly.view.foxglove import Foxglove
 from mjxfly.view.live_log import LiveLog, columns
 
 HOST = "127.0.0.1"
-PERIOD = 0.1  # [s] between two looks at the log
-SILENCE = 2.0  # [s] without anything new before the page says so
-LINGER = 2.0  # [s] that a page has to fetch a flight's end when the flight's process goes
+PERIOD = 0.1  # [s] between two reads of the log
+SILENCE = 2.0  # [s] without new records before the page reports it
+LINGER = 2.0  # [s] for an open page to fetch the last rows before the server ends
 BATCH = 20_000  # rows in an answer
-PATIENCE = 10.0  # [s] with a browser that does not go on
-# The page runs its own script, asks its own server, and nothing else.
+PATIENCE = 10.0  # [s] timeout of a request
+# The page may run its inline script and connect to its server, and load nothing else.
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; connect-src 'self'"
 
 
 def live_page(title: str, token: str) -> str:
-    """The page that asks its server for a flight while it is flown; `token` names the server."""
+    """Return the HTML page; `token` identifies the server that it polls for rows."""
     return page_of(title, {"token": token}, Path(__file__).with_name("live.js"))
 
 
 class LiveView:
-    """What the pages are told: written by the loop, read by the server's threads."""
+    """Content of the answers to the page: written by the main loop, read by the server's threads."""
 
     def __init__(self, log: LiveLog):
         self.page = live_page(f"{log.path.name}, live", token := secrets.token_hex(8)).encode()
@@ -49,7 +49,7 @@ class LiveView:
         self._log, self._last_news = log, time.monotonic()
 
     def update(self) -> bool:
-        """Read on in the log; true if there was something."""
+        """Read new records of the log; return whether there were any."""
         with self.lock:
             added = self._log.update()
         if added:
@@ -57,7 +57,7 @@ class LiveView:
         return added
 
     def answer(self, after: int) -> dict[str, Any]:
-        """The rows from number `after` on, and how the flight is."""
+        """Return at most `BATCH` rows from number `after` on, as packed arrays, and the flight's status."""
         now = time.monotonic()
         with self.lock:
             log = self._log
@@ -75,13 +75,13 @@ class LiveView:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves the page of a board and its rows, to this machine alone."""
+    """Serves the page of a `LiveView` and its rows on the loopback."""
 
     daemon_threads = True
     block_on_close = False
 
     def __init__(self, port: int, view: LiveView):
-        """Listen on `port` of the loopback, 0 for a free one. Raises InputError if it is taken."""
+        """Listen on `port` of the loopback, 0 for a free one. Raises InputError if it cannot be opened."""
         self.view = view
         try:
             super().__init__((HOST, port), Handler)
@@ -89,37 +89,37 @@ class Server(ThreadingHTTPServer):
             raise InputError(f"port {port} cannot be had: {error.strerror or error}; choose another") from None
 
     def server_bind(self) -> None:
-        """Bind without asking a name server what this machine is called."""
+        """Bind without the reverse DNS lookup of the base class."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = HOST, self.server_address[1]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away is no news."""
+        """Ignore connections that the browser drops."""
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """The URL of the page."""
         return f"http://{HOST}:{self.server_port}/"
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request: the page, or rows."""
+    """Handler of one request, for the page or for rows."""
 
     server: Server
     timeout = PATIENCE
 
     def do_GET(self) -> None:
-        """Answer, or refuse whatever is neither the page nor its rows."""
+        """Send the page or its rows, or an error."""
         port, view = self.server.server_port, self.server.view
-        # A page of elsewhere whose name was made to lead here carries that name.
+        # DNS rebinding: a foreign name that resolves to the loopback appears as the host.
         if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
             self._send(403, "text/plain", b"this page is for this machine alone\n")
             return
-        asked = urlsplit(self.path)
-        if asked.path == "/":
+        url = urlsplit(self.path)
+        if url.path == "/":
             self._send(200, "text/html; charset=utf-8", view.page)
-        elif asked.path == "/rows":
-            self._rows(view, parse_qs(asked.query))
+        elif url.path == "/rows":
+            self._rows(view, parse_qs(url.query))
         else:
             self._send(404, "text/plain", b"there is only the page\n")
 
@@ -142,15 +142,14 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Nothing: ten requests a second."""
+        """Log nothing: a page sends ten requests a second."""
 
 
 def follow(path: Path, port: int = 0, attached: bool = False, foxglove: int | None = None) -> int:
-    """Serve the flight log `path` until Ctrl-C, or, if `attached`, until standard input ends; returns the exit code.
+    """Serve the flight log `path` until Ctrl-C, or, if `attached`, until standard input ends; return the exit code.
 
-    With `foxglove`, a port, for Foxglove as well.
-
-    Prints the address, and unless attached what happens to the log. Raises InputError if `path` is no flight log.
+    `foxglove`: port of a server for Foxglove, None for none. Prints the address and, unless attached, the end of the
+    flight. Raises InputError if `path` is no flight log.
     """
     if foxglove is None:
         return _follow(LiveLog(path), port, attached)
@@ -160,7 +159,7 @@ def follow(path: Path, port: int = 0, attached: bool = False, foxglove: int | No
 
 def _follow(log: LiveLog, port: int, attached: bool, also: str = "") -> int:
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(10)  # whatever flies comes first
+        os.nice(10)  # lower priority than the flight's process
     view, leave = LiveView(log), threading.Event()
     with contextlib.closing(log), _serving(Server(port, view)) as address, _until(leave, attached):
         begun = view.update()
@@ -172,7 +171,7 @@ def _follow(log: LiveLog, port: int, attached: bool, also: str = "") -> int:
 
 
 def _watch(view: LiveView, log: LiveLog, leave: threading.Event, attached: bool) -> None:
-    """Read on until it is time to leave."""
+    """Read new records until `leave` is set."""
     announced = False
     while True:
         busy = view.update()
@@ -184,7 +183,7 @@ def _watch(view: LiveView, log: LiveLog, leave: threading.Event, attached: bool)
 
 
 def _linger(view: LiveView) -> None:
-    """Let an open page fetch the rest."""
+    """Wait at most `LINGER` until an open page has fetched all rows."""
     until = time.monotonic() + LINGER
     while time.monotonic() < until and view.update():
         pass
@@ -194,12 +193,12 @@ def _linger(view: LiveView) -> None:
         and time.monotonic() < min(until, view.last_request + LINGER)
     ):
         time.sleep(0.02)
-    time.sleep(0.1 if view.last_request is not None else 0.0)  # the last answer is on its way
+    time.sleep(0.1 if view.last_request is not None else 0.0)  # the last answer is still being sent
 
 
 @contextlib.contextmanager
 def _serving(server: Server) -> Iterator[str]:
-    """The server on a thread of its own; yields its address."""
+    """Run the server in a thread; yields its address."""
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
     thread.start()
     try:

@@ -1,4 +1,4 @@
-"""A flight log while it is written: what was added since it was last looked at, as rows that the page can show."""
+"""Incremental reader of a flight log that is being written: its new records as rows for the live view's page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mjxfly.supervisor import State
 from mjxfly.telemetry import Rig, object_state
 from mjxfly.view.marks import FlightStatus, placed
 
-# A row, in this order: name and number of values, in SI units.
+# Columns of a row in this order: name and number of values, in SI units.
 COLUMNS = {
     "time": 1,  # from the first tick
     "position": 3,
@@ -35,15 +35,15 @@ COLUMNS = {
     "battery": 2,
     "late": 1,
 }
-STEP = 0.04  # [s] between two rows at least: nobody sees more while it happens
-NO_LAW = (0.0, 0.0, 0.0)
+STEP = 0.04  # [s] shortest time between two rows: 25 frames a second are enough for a live view
+NO_COMMAND = (0.0, 0.0, 0.0)  # in phases without a controller
 
 
 class LiveLog:
-    """A log that is being written. `update` reads on; `rows` and `status` say what is known."""
+    """A log that is being written. `update` reads new records into `rows` and `status`."""
 
     def __init__(self, path: Path, hear: Callable[[Record], None] = lambda _: None):
-        """Follow the log `path`, which need not exist yet; `hear` is called with every record."""
+        """Follow the log `path`, which need not exist yet; `hear` is called for every record."""
         self.path = path
         self.rows: list[list[float]] = []
         self.plant: dict[str, Any] | None = None  # None: the log has not begun
@@ -52,10 +52,10 @@ class LiveLog:
         self._newest: list[DroneState | None] = [None, None]
         self._start: float | None = None
         self._target: np.ndarray | None = None
-        self._firmware: FirmwareSetup  # once the log has begun
+        self._firmware: FirmwareSetup  # set by the header
 
     def update(self) -> bool:
-        """Read what was added, a chunk at most; true if there was something. Raises InputError: no flight log."""
+        """Read new records, at most one chunk; return whether there were any. Raises InputError for no flight log."""
         records = self._tail.read()
         for record in records or ():
             self.status.take(record)
@@ -67,7 +67,7 @@ class LiveLog:
 
     @property
     def marks(self) -> tuple[Mark, ...]:
-        """On the time axis of `rows`."""
+        """The status's marks on the time axis of `rows`."""
         if self._start is None or not self.rows:
             return ()
         return placed(self.status.marks, self._start, self.rows[-1][0])
@@ -92,40 +92,40 @@ class LiveLog:
         self._curves = self._firmware.force_curves(self._config)
         plant = self._config.plant
         self._rig = Rig.of_plant(plant)
-        # Of whichever curve: it is known once the motors turn, when the page has its scale.
+        # Over all curves: the one in use is known only when the motors turn, after the page has set its scale.
         known = [own.map.curve for one in variants(self._config) for own in one.values()]
         strongest = max(curve.force(packets.THRUST_CEILING) for curve in (*self._curves, *known))
         self.plant = {**plant_of(plant), "thrust": strongest}
 
     def _tick(self, record: Record) -> None:
-        seen = [state for state in self._newest if state is not None]
+        states = [state for state in self._newest if state is not None]
         if self._target is None or record["state"] != State.LAND.value:  # see `Recording.target`
             self._target = record["goal"]
         now = record["t"]
         self._start = now if self._start is None else self._start
         time = now - self._start
         late_enough = time >= self.rows[-1][0] + STEP - 1e-3 if self.rows else time >= 0.0
-        if len(seen) < 2 or not late_enough or time > LONGEST:
+        if len(states) < 2 or not late_enough or time > LONGEST:
             return
-        pair = object_state(seen, self._rig)
+        pair = object_state(states, self._rig)
         thrust = [curve.force(sent[3]) for curve, sent in zip(self._curves, record["sent"], strict=True)]
         values = {
             "time": time,
             "position": pair.position,
             "euler": rotations.euler_from_matrix(pair.matrix),
             "quaternion": pair.quaternion,
-            "leader_command": record.get("leader", NO_LAW),
-            "follower_command": record.get("follower", NO_LAW),
+            "leader_command": record.get("leader", NO_COMMAND),
+            "follower_command": record.get("follower", NO_COMMAND),
             "target": self._target,
             "thrust": thrust,
-            "battery": [state.battery for state in seen],
+            "battery": [state.battery for state in states],
             "late": record.get("late", 0.0),
         }
         self.rows.append([float(value) for name in COLUMNS for value in np.ravel(values[name])])
 
 
 def columns(rows: list[list[float]]) -> dict[str, np.ndarray]:
-    """Rows as one array for each column, flat."""
+    """Return `rows` as one flat float32 array for each column."""
     table = np.array(rows, np.float32).reshape(len(rows), sum(COLUMNS.values()))
     edges = np.cumsum([0, *COLUMNS.values()])
     return {name: table[:, low:high].ravel() for name, low, high in zip(COLUMNS, edges, edges[1:], strict=False)}

@@ -1,4 +1,4 @@
-"""Command line of `python -m mjxfly.view`: what mjxball.view shows, flight logs, a flight while it is flown."""
+"""Command line of `python -m mjxfly.view`: the sources of mjxball.view, flight logs, and a flight in progress."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mjxfly.view.recorded import read_log
 
 
 def parser() -> Parser:
-    """The argument parser of `python -m mjxfly.view`."""
+    """Return the argument parser."""
     result = make_view_parser("python -m mjxfly.view", "flight log (.jsonl, .mcap), recorded flight (.npz)")
     live = result.add_argument_group("while it is flown")
     live.add_argument(

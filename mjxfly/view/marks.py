@@ -1,4 +1,4 @@
-"""What a flight log says of how the flight goes: a text for now, and marks on the time axis."""
+"""Status of a flight from the records of its log: a text, a level, and marks on the time axis."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mjxfly.log_import import is_foreign
 from mjxfly.log_schema import Record, decode
 from mjxfly.supervisor import FAULTS, State
 
-GOOD = {State.FLY.value, State.LAND.value}  # both laws are in command
+GOOD = {State.FLY.value, State.LAND.value}  # both controllers are in command
 BAD = {State.HOLD.value, State.DESCEND.value, State.KILL.value}
-OVER = {State.STOP.value, State.DONE.value}  # as good or bad as what came before
+OVER = {State.STOP.value, State.DONE.value}  # they keep the level of the state before
 SEVERITY = {state.value: state.severity for state in State}
 FAULT_NAMES = {event.name for event in FAULTS}
-STREAMS = (b'"kind": "state"', b'"kind": "health"', b'"kind": "pose"')  # nearly all of a log, and no marks
+STREAMS = (b'"kind": "state"', b'"kind": "health"', b'"kind": "pose"')  # most lines of a log; they make no marks
 
 
 class FlightStatus:
-    """How the flight goes, by the records of its log: `text` in words, `level`, `ended`, and `marks`.
+    """Status of a flight by the records of its log: `text`, `level`, `ended`, and `marks` at times of the log.
 
-    `level` is busy, good (the laws are in command, or it ended well) or bad (a fault). Marks have the log's times.
+    `level` is "busy", "good" (the controllers are in command, or the flight ended well) or "bad" (a fault).
     """
 
     def __init__(self, text: str):
@@ -34,7 +34,7 @@ class FlightStatus:
         self._why, self._begun = "", 0.0
 
     def take(self, record: Record) -> None:
-        """Note any record but states."""
+        """Update the status by a record of any kind; states change nothing."""
         kind, now = record["kind"], record["t"]
         if kind == "header":
             self.text, self._begun = "connecting and checking", now
@@ -52,13 +52,13 @@ class FlightStatus:
             self._end(now, level, f"the flight has ended, exit code {record['code']}{why}")
 
     def fail(self, why: str) -> None:
-        """The log itself cannot be followed."""
+        """Report that the log cannot be read because of `why`; an earlier fault keeps its text."""
         if self.level != "bad":
             self.level, self._why = "bad", why
             self.text = f"the log cannot be placed in time: {why}"
 
     def _enter(self, state: str) -> None:
-        """What the supervisor does, and why once it is on the way down."""
+        """Show the supervisor's `state`, and the reason once it descends."""
         if self.ended:
             return
         self.text = f"{state}: {self._why}" if self._why else state
@@ -92,25 +92,25 @@ def _words(event: str) -> str:
 
 
 def placed(marks: Sequence[Mark], begin: float, last: float) -> tuple[Mark, ...]:
-    """`marks` counted from the time `begin` and put between 0 and `last`; phases that were over by then are not."""
+    """Return `marks` at times relative to `begin`, clipped to 0 .. `last` [s], without phases that ended before 0."""
     moved = [mark._replace(time=min(max(mark.time - begin, 0.0), last)) for mark in marks]
     phases = [mark for mark in moved if mark.kind == "phase"]
-    over = {id(one) for one, after in itertools.pairwise(phases) if after.time < 1e-6}
-    return tuple(mark for mark in moved if id(mark) not in over)
+    ended = {id(one) for one, after in itertools.pairwise(phases) if after.time < 1e-6}
+    return tuple(mark for mark in moved if id(mark) not in ended)
 
 
 def marks_of_log(path: Path, last: float) -> tuple[Mark, ...]:
-    """Marks of the whole log `path`, whose last tick is at `last` [s] of the recorded flight."""
+    """Return the marks of the complete log `path`, whose last tick is at `last` [s] of the recorded flight."""
     status, end = FlightStatus(""), 0.0
-    for record in _told(path):
+    for record in _relevant_records(path):
         status.take(record)
         if record["kind"] == "tick":
             end = max(end, record["t"])
     return placed(status.marks, end - last, last)
 
 
-def _told(path: Path) -> Iterable[Record]:
-    """Records of a log that was read before, but not those that come in streams: of the ticks the last alone."""
+def _relevant_records(path: Path) -> Iterable[Record]:
+    """Yield the log's records except `STREAMS`, and only the last tick. Lines that do not parse are skipped."""
     if is_foreign(path):
         yield from read(path)
         return

@@ -1,4 +1,4 @@
-"""A flight log as a flight to play."""
+"""Conversion of a flight log to a `Flight` of the viewer."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ from mjxfly.view.marks import marks_of_log
 
 
 def read_log(path: Path) -> Flight:
-    """The flight in a log of `mjxfly`, from where its motors first turned.
+    """Return the flight in a log of `mjxfly`, from the start of its motors. Raises InputError for no flight log.
 
-    The CG, the object's mass and the contact forces are not in a log: they are 0 and the plant's mass here, and no page
-    shows them.
+    A log does not contain CG, object mass and contact forces; they are set to 0, the plant's mass and 0, and not shown.
     """
     if path.suffix != ".jsonl" and not is_bag(path):
         raise InputError(
