@@ -24,7 +24,7 @@ from mjxfly.setpoints import CommandMap
 from mjxfly.telemetry import ObjectState, Rig
 
 BEGIN = 0.85  # of the ramp, at 88 % of hover: a side that the load is not on comes off at 96 %
-MOST = 1.25  # share of hover that is tried: a rig that needs more is not the one that the policy was trained for
+MOST_LIFT = 1.25  # share of hover that is tried: a rig that needs more is not the one that the policy was trained for
 CLIMB = 0.1  # [m/s] upward that is held
 CLIMB_GAIN = 0.4  # share of hover per m/s that is missing
 CLIMB_INTEGRAL = 1.5  # likewise per m: a pair that stands gets 15 % of hover more a second
@@ -76,12 +76,12 @@ class TakeOff:
     def _shares(self, angle: float, seen: ObjectState, height: float) -> tuple[float, float]:
         """Shares of hover of leader and follower: a climb that is held, a stick that comes to be level."""
         missing = CLIMB - float(seen.velocity[2])
-        self._share = min(max(self._share + CLIMB_INTEGRAL * self._period * missing, 0.0), MOST)
+        self._share = min(max(self._share + CLIMB_INTEGRAL * self._period * missing, 0.0), MOST_LIFT)
         off = angle - self._resting * (1.0 - min(max(height / self._lifted_at, 0.0), 1.0))
         turning = float((seen.matrix @ rotations.cross(seen.rates, self._along))[2])
         self._apart = _clip(self._apart + LEVEL_INTEGRAL * self._period * off, APART)
         apart = _clip(self._apart + LEVEL_GAIN * off + LEVEL_DAMPING * turning, APART)
-        both = min(self._share + CLIMB_GAIN * missing, MOST)
+        both = min(self._share + CLIMB_GAIN * missing, MOST_LIFT)
         return both - apart, both + apart
 
     def needed(self, quaternions: Sequence[np.ndarray]) -> tuple[float, float]:
@@ -101,7 +101,7 @@ class TakeOff:
             share, bound = thrust / constants.hover_thrust, ""
             if thrust >= THRUST_CEILING:
                 bound = ", the most that is ever sent"
-            elif share >= MOST - 0.01:
+            elif share >= MOST_LIFT - 0.01:
                 bound = ", the most that is tried"
             found.append(f"the {name} was sent {thrust:.0f} units ({share:.2f} of what should hover{bound})")
         return f"{STUCK}: {' and '.join(found)}; is it heavier, or does a propeller give less?"

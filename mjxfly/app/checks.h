@@ -15,7 +15,6 @@
 #define VARIANCE 5e-4f          /* [m2] */
 #define MOST_PLACE 1000.0f      /* [m] coordinate of a state */
 #define MOST_SPEED 50.0f        /* [m/s] of a state and of a heartbeat */
-#define APART 0.15f             /* largest half difference of the drones' lifts [hover] */
 #define MOST_RATE 50.0f         /* [rad/s]; the gyroscope's range is 35 */
 #define MOST_VOLTAGE 10.0f      /* [V] */
 

@@ -19,23 +19,10 @@
 #define SETTLED 300u
 #define SATURATED_TIME 1000u
 #define BATTERY_TIME 5000u
-#define NEAR_GROUND 0.04f     /* [m] */
 #define STILL 0.12f           /* [m/s] */
 #define REST 150u             /* [ms] it has landed if it does not sink by more than RESTING for this time */
 #define RESTING 0.005f        /* [m] */
-#define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
-/* The take-off, as in takeoff.py of mjxfly. */
-#define BEGIN 0.85f           /* fraction of the ramp after which the climb rate is controlled */
 #define LIFT_TIME 4000u       /* [ms] after the ramp */
-#define LIFTED 0.05f          /* [m] */
-#define MOST_LIFT 1.25f       /* [hover] */
-#define CLIMB 0.1f            /* [m/s] */
-#define CLIMB_GAIN 0.4f
-#define CLIMB_INTEGRAL 1.5f
-#define LEVEL_GAIN 2.5f
-#define LEVEL_DAMPING 0.35f
-#define LEVEL_INTEGRAL 15.0f
-#define LOAD 0.03f
 #define SIDE (MJXBALL_FOLLOWER ? 1.0f : -1.0f) /* sign of `apart` in this drone's lift */
 
 const char *mjxball_text(int cause) {

@@ -17,7 +17,8 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import APP, c_header, float_bytes, footprint, weight_bytes
-from mjxfly import card
+from mjxball.sim import laws
+from mjxfly import card, flight, setpoints, takeoff
 from mjxfly.app.protocol import CAUSES
 from mjxfly.setpoints import CURVE_NAMES
 from mjxfly.telemetry import Rig
@@ -42,6 +43,14 @@ SAME = (
     "plant",
     "config",
 )
+# Constants of the laptop's flight that the C files use by their names here, `rig.h` defines them.
+SHARED = {
+    laws: ("MAX_LIFT_DIFFERENCE", "WASHOUT_TIME"),
+    setpoints: ("NEAR_GROUND", "BRAKE_TILT"),
+    flight: ("LIFTED",),
+    takeoff: ("BEGIN", "MOST_LIFT", "CLIMB", "CLIMB_GAIN", "CLIMB_INTEGRAL", "LEVEL_GAIN")
+    + ("LEVEL_DAMPING", "LEVEL_INTEGRAL", "LOAD", "APART"),
+}
 EXACT = ("-ffp-contract=off", "-fno-math-errno")
 
 
@@ -117,8 +126,13 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
     }
     lines = ",\n".join(f"    .{name} = {_literal(value)}" for name, value in fields.items())
     causes = ",\n".join(f'    "{text}"' for text in CAUSES)
+    defined = "".join(
+        f"#define {name} {_literal(float(getattr(module, name)))}\n"
+        for module, names in SHARED.items()
+        for name in names
+    )
     return (
-        f"/* See core.h. */\n#pragma once\nstatic const mjxball_rig_parameters mjxball_rig = {{\n{lines},\n}};\n\n"
+        f"/* See core.h. */\n#pragma once\n{defined}static const mjxball_rig_parameters mjxball_rig = {{\n{lines},\n}};\n\n"
         f"static const char *const mjxball_texts[MJXBALL_CAUSES] = {{\n{causes},\n}};\n"
     )
 

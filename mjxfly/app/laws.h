@@ -6,8 +6,6 @@
 
 #include "rig.h"
 
-#define MAX_LIFT_DIFFERENCE 1.5f /* [m/s2] */
-#define WASHOUT_TIME 8.0f /* [s] */
 #define MOST_INTEGRAL 1000.0f    /* [m s] of the leader's error */
 
 /* Arithmetic. */
