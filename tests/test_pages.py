@@ -115,7 +115,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
         ("margin of # degrees and a gain margin of # either", NEED.phase, NEED.gain),
         ("(# degrees and # for lags of # to", NEED.worst_phase, NEED.worst_gain, 1e3 * NEED.lags[0]),
         (" # ms and inertias of # to #), and", 1e3 * NEED.lags[1], *NEED.inertias),
-        ("rate loop # times as … stands at # of hover", NEED.bandwidth_ratio, takeoff.MOST),
+        ("rate loop # times as … stands at # of hover", NEED.bandwidth_ratio, takeoff.MOST_LIFT),
         ("by # % a second until a climb of # m/s", 100 * takeoff.CLIMB_INTEGRAL * takeoff.CLIMB, takeoff.CLIMB),
     ),
     "docs/flying": (

@@ -48,8 +48,10 @@ SHARED = {
     laws: ("MAX_LIFT_DIFFERENCE", "WASHOUT_TIME"),
     setpoints: ("NEAR_GROUND", "BRAKE_TILT"),
     flight: ("LIFTED",),
-    takeoff: ("BEGIN", "MOST_LIFT", "CLIMB", "CLIMB_GAIN", "CLIMB_INTEGRAL", "LEVEL_GAIN")
-    + ("LEVEL_DAMPING", "LEVEL_INTEGRAL", "LOAD", "APART"),
+    takeoff: (
+        *("BEGIN", "MOST_LIFT", "CLIMB", "CLIMB_GAIN", "CLIMB_INTEGRAL"),
+        *("LEVEL_GAIN", "LEVEL_DAMPING", "LEVEL_INTEGRAL", "LOAD", "APART"),
+    ),
 }
 EXACT = ("-ffp-contract=off", "-fno-math-errno")
 
@@ -132,7 +134,8 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         for name in names
     )
     return (
-        f"/* See core.h. */\n#pragma once\n{defined}static const mjxball_rig_parameters mjxball_rig = {{\n{lines},\n}};\n\n"
+        f"/* See core.h. */\n#pragma once\n{defined}"
+        f"static const mjxball_rig_parameters mjxball_rig = {{\n{lines},\n}};\n\n"
         f"static const char *const mjxball_texts[MJXBALL_CAUSES] = {{\n{causes},\n}};\n"
     )
 

@@ -16,7 +16,7 @@ from mjxfly.card import Controller, goal_of, limits_of, load_policy
 from mjxfly.limits import FlightSettings, Times
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, State
-from mjxfly.takeoff import BEGIN, MOST, TakeOff
+from mjxfly.takeoff import BEGIN, MOST_LIFT, TakeOff
 from mjxfly.telemetry import ObjectState, Rig
 from mjxfly.twin import avionics
 from mjxfly.twin.conditions import Conditions, Surroundings
@@ -160,7 +160,7 @@ def test_thrust_of_a_pair_that_stands_rises_to_what_is_tried_at_most() -> None:
     found = shares(seen(), 4.0)
     assert (np.diff(found, axis=0) > -1e-4).all()
     assert np.diff(found, axis=0).max() < 0.02  # no step where the closed loop begins
-    np.testing.assert_allclose(found[-1], MOST, atol=1e-4)
+    np.testing.assert_allclose(found[-1], MOST_LIFT, atol=1e-4)
 
 
 def test_a_side_that_stays_down_in_the_air_is_lifted_apart_and_a_floor_that_slopes_is_not() -> None:
