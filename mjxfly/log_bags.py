@@ -1,4 +1,4 @@
-"""rosbag2 bags, MCAP or SQLite, as series of numbers: read by rosbags, and as far as it goes where a file is cut."""
+"""Time series from rosbag2 bags, MCAP or SQLite, read by rosbags; of a truncated MCAP file the intact part."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mjxfly.log_unpack import Unpacking, check_tables
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 BAGS, COMPRESSED = (".mcap", ".db3"), ".zstd"
-CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ as a rule
-ASTRAY = 1  # [s] by which one of them may: a stamp of 0 says that the message is of no time
-SHOWN = 6  # topics that a sentence names
+CLOCKS = 0.05  # [s] largest median difference between stamps and times of receipt
+ASTRAY = 1  # [s] largest difference of one message: a stamp of 0 means that it has none
+SHOWN = 6  # topics named in an error message
 
 
 class Found(NamedTuple):
-    """What a bag holds."""
+    """Contents of a bag."""
 
-    lines: bytes  # of a flight log of ours, empty: none
+    lines: bytes  # of our own flight log, empty if there is none
     series: Series
-    has: str  # its topics in words
+    has: str  # its topics and their types, for messages
 
 
 def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
-    """The bag `path`, a file or a folder. Raises InputError: it is none, is empty, or its clocks do not agree."""
+    """Read the bag `path`, a file or a folder. Raises InputError if it is none, is empty, or its clocks disagree."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -44,18 +44,18 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
                 return _contents(path, reader, unpacking)
         except InputError:
             raise
-        except Exception as error:  # of any of the libraries that read it
+        except Exception as error:  # the libraries raise many types
             unpacking.refuse()
             raise InputError(f"bag {path} cannot be read: {said(error)}") from None
 
 
 def is_bag(path: Path) -> bool:
-    """Whether `path` is called as a bag's file is, compressed or not."""
+    """Whether `path` has the suffix of a bag's file, compressed or not."""
     return path.name.removesuffix(COMPRESSED).endswith(BAGS)
 
 
 def _files(path: Path) -> list[Path]:
-    """The bag `path` itself, or the files of a folder; they hold all that its metadata.yaml says."""
+    """The file `path`, or the bag files in the folder; metadata.yaml is not needed. Raises InputError without any."""
     if path.is_file():
         return [path]
     inside = [path, *path.iterdir()] if path.is_dir() else [path]
@@ -70,7 +70,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _unpacked(path: Path, spare: Path, unpacking: Unpacking) -> Path:
-    """`path`, or in the folder `spare` what it was compressed from."""
+    """`path`, or its decompressed copy in the folder `spare`."""
     if path.suffix != COMPRESSED:
         return path
     unpacking.copy(path, spare / path.stem)
@@ -78,7 +78,7 @@ def _unpacked(path: Path, spare: Path, unpacking: Unpacking) -> Path:
 
 
 def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Unpacking) -> Path:
-    """`path`, or a copy in the folder `spare` of an MCAP file as far as it goes, if its end is missing."""
+    """`path`, or a copy of the intact part in the folder `spare` if it is a truncated MCAP file."""
     if path.suffix == ".db3":
         check_tables(path)
     if path.suffix != ".mcap":
@@ -96,7 +96,7 @@ def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Un
 
 
 def _ends(path: Path) -> bool:
-    """Whether the MCAP file `path` has an end."""
+    """Whether the MCAP file `path` has its closing magic bytes."""
     with path.open("rb") as stream:
         size = stream.seek(0, 2)
         stream.seek(max(0, size - len(MAGIC)))
@@ -104,9 +104,9 @@ def _ends(path: Path) -> bool:
 
 
 def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
-    """Write what comes before the first damage of the MCAP file `path` to the new file `copy`; how many messages.
+    """Copy the part of the MCAP file `path` before the first damage to the new file `copy`; return the message count.
 
-    Raises InputError: not even the header does.
+    Raises InputError if the header is damaged.
     """
     from mcap.records import Channel, Header, Message, Schema
     from mcap.writer import Writer
@@ -114,7 +114,7 @@ def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
     count, schemas, channels, begun = 0, {0: 0}, dict[int, int](), False
     with path.open("rb") as stream, copy.open("xb") as target:
         writer = Writer(target)
-        with contextlib.suppress(Exception):  # whatever a record raises that is not whole
+        with contextlib.suppress(Exception):  # of the first damaged record
             for one in unpacking.records(stream, path.stat().st_size):
                 if isinstance(one, Header):
                     writer.start(one.profile)
@@ -135,12 +135,13 @@ def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
 
 
 def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
+    """Read all known topics of an open bag. Raises InputError if it is empty or its clocks disagree."""
     topics = {one.topic: one.msgtype.replace("/msg/", "/") for one in reader.connections}
     has = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:SHOWN])
     if reader.message_count == 0:
         raise InputError(f"bag {path} is empty: it holds no message; expected those of a flight")
     if f"/{HEADER}" in topics:
-        # A bag is sorted by time, and the first line may have a later one.
+        # A bag is sorted by time, and the header need not be its earliest line.
         lines = [
             part[RECORD] for name in (HEADER, RECORD) for *_, part in _parts(path, reader, unpacking, {f"/{name}"})
         ]
@@ -152,11 +153,11 @@ def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
         stamped = abs(received - now) <= ASTRAY * 10**9
-        for quantity, numbers in values.items():
-            _check_width(path, topic, quantity, len(numbers))
+        for quantity, row in values.items():
+            _check_width(path, topic, quantity, len(row))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
             times.append(((now if stamped else received) - reader.start_time) * 1e-9)
-            rows.append(numbers if stamped else (np.nan,) * len(numbers))
+            rows.append(row if stamped else (np.nan,) * len(row))
     _check_clocks(path, apart)
     return Found(b"", _densest(found), has)
 
@@ -201,9 +202,9 @@ def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:
 
 
 def _densest(found: dict[tuple[str, str, str], tuple[list[float], list[Any]]]) -> Series:
-    """Of several topics for one quantity of a drone that with the most messages, in the order of time.
+    """Series by drone and quantity, sorted by time: of several topics with one quantity that with the most messages.
 
-    One of zeros, which nobody measured, comes last.
+    A topic with zeros only was not measured and is used if there is no other.
     """
     series: Series = {}
     for (drone, quantity, _), (times, rows) in sorted(
