@@ -43,7 +43,7 @@ class Figures:
             return f"{text}; {tilt}"
         # A stronger motor needs less thrust; an uneven load has the same effect.
         leader, follower = (f"{100 * (share - 1):+.0f}" for share in self.thrust)
-        return f"{text}; {tilt}; thrust {leader} / {follower} % of the card's"
+        return f"{text}; {tilt}; thrust {leader} / {follower} % from nominal"
 
 
 class Flown:
