@@ -95,7 +95,7 @@ ORDERS = {
     State.KILL: Phase.STOP,
 }
 # Event for a phase that an app enters by itself, while the laptop flies or lands.
-NEWS = {
+PHASE_EVENTS = {
     Phase.LAND: Event.APP_LANDS,
     Phase.DESCEND: Event.APP_DESCENDS,
     Phase.STOP: Event.APP_STOPS,
@@ -103,7 +103,7 @@ NEWS = {
 }
 LANDED = (reason(1), reason(2), reason(18))  # causes of a stop that was requested, or that follows a touchdown
 # Events that the apps handle, or that only apply to setpoints sent by the laptop.
-THEIRS = (Event.UNHEARD, Event.DEADLINES, Event.SATURATED, Event.GAPS)
+HANDLED_BY_APPS = (Event.UNHEARD, Event.DEADLINES, Event.SATURATED, Event.GAPS)
 
 
 def settings_of(settings: FlightSettings) -> FlightSettings:
@@ -147,14 +147,14 @@ class OnboardFlight(Flight):
                 self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
         return None, []
 
-    def _is_off(self) -> bool:
+    def _is_airborne(self) -> bool:
         """True once an app reports that its controller flies."""
         return self.settings.dry_run or any(app is not None and app.phase >= Phase.FLY for app in self._apps())
 
-    def _stuck(self) -> str:
+    def _stuck_message(self) -> str:
         return f"{STUCK}: is it heavier, or does a propeller give less?"
 
-    def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+    def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
         return [ZERO, ZERO]
 
     def _send(self, link: DroneLink, watch: UplinkWatch, value: Setpoint) -> None:
@@ -170,13 +170,13 @@ class OnboardFlight(Flight):
 
     def _note_ending(self, faults: list[Fault], gap: float) -> None:
         """Record the faults of the apps, and those of the laptop that the apps do not handle."""
-        super()._note_ending([fault for fault in faults if fault.event not in THEIRS] + self._app_faults, gap)
+        super()._note_ending([fault for fault in faults if fault.event not in HANDLED_BY_APPS] + self._app_faults, gap)
 
     def _translated(self, fault: Fault) -> Fault | None:
         """The fault as it applies to a flight on board; None if the apps handle it."""
         if self.supervisor.state not in AIRBORNE:
             return self._before_lift(fault)
-        if fault.event in THEIRS:
+        if fault.event in HANDLED_BY_APPS:
             return None
         # The drone that is still connected lands, and the app of the other one follows it.
         lost = fault.event in (Event.STALE, Event.LINK_LOST, Event.FROZEN)
@@ -201,9 +201,9 @@ class OnboardFlight(Flight):
             self._note_app(name, app)
             if state is State.SPIN and self.elapsed > STATE_AGE and app.phase <= Phase.SPIN and app.refusal:
                 found.append(Fault(Event.APP_REFUSES, f"{name}: {reason(app.refusal)}"))
-            elif state in AIRBORNE and app.phase in NEWS and self.elapsed > STATE_AGE / 2:
+            elif state in AIRBORNE and app.phase in PHASE_EVENTS and self.elapsed > STATE_AGE / 2:
                 ended = app.phase in (Phase.STOP, Phase.IDLE) and state in (State.LAND, State.DESCEND)
-                event = Event.TOUCHED_DOWN if ended and reason(app.cause) in LANDED else NEWS[app.phase]
+                event = Event.TOUCHED_DOWN if ended and reason(app.cause) in LANDED else PHASE_EVENTS[app.phase]
                 found.append(Fault(event, f"{name}: {reason(app.cause)}"))
         if self.settings.dry_run:
             return []

@@ -174,8 +174,8 @@ def listening(land: Callable[[], None], interrupt: Callable[[], None], kill: Cal
     def caught(number: int, frame: FrameType | None) -> None:
         (interrupt if number == signal.SIGINT else land)()
 
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, caught) for number in numbers}
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, caught) for number in signals}
     with _raw_terminal() as terminal:
         if terminal is not None:
             threading.Thread(target=_read, args=(terminal, done, land, kill), daemon=True).start()

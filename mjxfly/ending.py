@@ -42,7 +42,7 @@ class Signals:
     def __init__(self, settings: FlightSettings):
         bounds = settings.limits
         # Time [s] for which these faults have lasted when they are first reported.
-        self._lead = {
+        self._delay = {
             Event.STALE: bounds.state_age,
             Event.LINK_LOST: bounds.state_age,
             Event.UNHEARD: bounds.state_age,
@@ -50,27 +50,27 @@ class Signals:
             Event.SATURATED: bounds.saturation_time,
         }
         self._period = settings.period
-        self._open: dict[tuple[Event, str], Signal] = {}
-        self._all: list[Signal] = []
+        self._active: dict[tuple[Event, str], Signal] = {}
+        self._history: list[Signal] = []
 
     def update(self, faults: Sequence[Fault], now: float, gap: float = 0.0) -> None:
         """Add the `faults` of one tick at `now` [s], `gap` [s] after the previous one."""
         late = max(gap - self._period, 0.0)
         for fault in faults:
             if fault.event not in (*PLANNED, Event.INTERRUPT, Event.TIMEOUT, Event.DEADLINES):
-                self._note(fault.event, str(fault), now - self._lead.get(fault.event, 0.0), now)
+                self._note(fault.event, str(fault), now - self._delay.get(fault.event, 0.0), now)
         missed = next((f" ({fault.detail})" for fault in faults if fault.event is Event.DEADLINES), "")
         if late > LATE or missed:
             # The stall explains missing messages, so it must precede the faults that these cause.
             text = f"this computer was too busy: a tick came {1e3 * late:.0f} ms late{missed}"
-            self._note(Event.DEADLINES, text, now - gap - self._lead[Event.STALE], now)
+            self._note(Event.DEADLINES, text, now - gap - self._delay[Event.STALE], now)
 
     def _note(self, event: Event, text: str, began: float, now: float) -> None:
         key = event, next((name for name in NAMES if name in text), "")
-        signal = self._open.get(key)
+        signal = self._active.get(key)
         if signal is None or now - signal.last > APART:
-            signal = self._open[key] = Signal(event, text, began, now)
-            self._all.append(signal)
+            signal = self._active[key] = Signal(event, text, began, now)
+            self._history.append(signal)
         signal.last = now
 
     def chain(self, cause: Fault, at: float) -> list[Signal]:
@@ -79,7 +79,7 @@ class Signals:
         Going back from the abort, a signal belongs to the chain if it lasted until `APART` before the chain so far
         began. Signals that ended more than `LAST` before the abort do not count.
         """
-        known = sorted((one for one in self._all if one.last >= at - LAST), key=lambda one: one.began)
+        known = sorted((one for one in self._history if one.last >= at - LAST), key=lambda one: one.began)
         first = at
         for one in sorted(known, key=lambda one: -one.last):
             if one.last >= first - APART:

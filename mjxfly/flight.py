@@ -58,7 +58,7 @@ class Flight:
         self.spin = SpinCheck(links, variants, assumed, settings.motor)
         self.highest = [0, 0]  # largest thrust of each drone so far, sent or withheld in a dry run [units]
         self._sent: list[Setpoint] = [ZERO, ZERO]
-        self._needed = (1.0, 1.0)  # hover force of leader and follower over nominal, found at take-off
+        self._hover_scale = (1.0, 1.0)  # hover force of leader and follower over nominal, found at take-off
         self._trims = [0.0, 0.0]  # hover thrust [units]: a running average of the sent thrust
         self._commands: Commands | None = None
         self._every = max(round(controller.period / settings.period), 1)  # ticks per command
@@ -67,11 +67,11 @@ class Flight:
         self._lift = LiftWatch(settings.motor)
         self.ending = Ending(settings, self._lifts_at)
         self._saturated = Sustained(settings.limits.saturation_time)
-        self._back = Sustained(settings.limits.fresh)
+        self._recovered = Sustained(settings.limits.fresh)
         self._holds = 0
         self._hold_for = settings.times.drone_watchdog
         self._descend_for = settings.times.descent_limit(settings.goal[2])
-        self._shares = [1.0]  # planned thrust over trim for each tick without a measured height
+        self._plan = [1.0]  # planned thrust over trim for each tick without a measured height
         self._land_height = 0.0
         self._heights = collections.deque([math.inf], round(settings.times.rest / settings.period) + 1)  # of O [m]
         self._highest_place = 0.0  # largest height of O above its start while the controllers are in command [m]
@@ -80,7 +80,7 @@ class Flight:
     @property
     def maps(self) -> tuple[CommandMap, CommandMap]:
         """Command maps of leader and follower: their firmwares' force curves, scaled by `TakeOff.needed`."""
-        leader, follower = (own.map.scaled(s) for own, s in zip(self.spin.chosen(), self._needed, strict=True))
+        leader, follower = (own.map.scaled(s) for own, s in zip(self.spin.chosen(), self._hover_scale, strict=True))
         return leader, follower
 
     @property
@@ -116,7 +116,7 @@ class Flight:
         the time since the previous tick.
         """
         self._read(now)
-        faults = self._from_outside(missed, gap)
+        faults = self._external_faults(missed, gap)
         faults += self._monitor.update(self.supervisor.state, self.links, self._ages, now)
         if self._mocap is not None and any(fault.event is Event.FRAME for fault in faults):
             self._mocap.halt()
@@ -124,7 +124,7 @@ class Flight:
         mapped, broken = self._command()
         self._advance(faults + broken + self._progress())
         self._note_ending(faults + broken, gap)
-        wanted = self._wanted(mapped)
+        wanted = self._setpoints(mapped)
         self._transmit(wanted)
         self._record(wanted, late, missed)
         self._count += 1
@@ -135,9 +135,9 @@ class Flight:
         if any(self._fresh) and self.supervisor.state not in ON_GROUND:
             seen = self._object()
             place, climb = seen.position - self._monitor.origin, float(seen.velocity[2])
-            self.ending.touchdown.update(place, climb, self._now, self._doubt())
+            self.ending.touchdown.update(place, climb, self._now, self._distrust())
 
-    def _doubt(self) -> str:
+    def _distrust(self) -> str:
         """Why the pair's estimated state cannot be trusted, empty if it can."""
         fresh = [state for state, known in zip(self._states, self._fresh, strict=True) if known]
         if not all(tilt_angle(state.quaternion) <= self.settings.limits.tilt for state in fresh):
@@ -158,7 +158,7 @@ class Flight:
 
     # Faults and events.
 
-    def _from_outside(self, missed: int, gap: float) -> list[Fault]:
+    def _external_faults(self, missed: int, gap: float) -> list[Fault]:
         """Faults and requests of user, links, control loop, motion capture, batteries and watchdog."""
         bounds, faults = self.settings.limits, []
         if self.kill or self.interrupts > 1:
@@ -201,14 +201,14 @@ class Flight:
     def _trusted(self) -> ObjectState | None:
         return self._monitor.object if any(self._monitor.estimators.trusted) else None
 
-    def _stands(self) -> bool:
+    def _landed(self) -> bool:
         seen, times = self._trusted(), self.settings.times
         if seen is None:  # no trusted estimate: assume it once the planned blind descent and a margin have passed
-            return self.elapsed >= len(self._shares) * self.settings.period + times.settled
+            return self.elapsed >= len(self._plan) * self.settings.period + times.settled
         low = self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
         return low and self._heights[0] - self._heights[-1] < times.rest_sunk
 
-    def _is_off(self) -> bool:
+    def _is_airborne(self) -> bool:
         """True once the pair is off the ground, so that the controllers may take over."""
         seen = self._trusted()
         return self.settings.dry_run or (seen is not None and self._height(seen) >= self._lifts_at)
@@ -272,13 +272,13 @@ class Flight:
         flying = any(info & packets.FLYING for info in infos) or not all(self._fresh)
         hindered = self._holds > self.settings.limits.gaps + 1 or any(link.lost for link in self.links)
         heard = all(self._fresh) and all(watch.hears for watch in self._monitor.uplinks)
-        resumes = heard and self.supervisor.may_resume and not (hindered or self._stands())
+        resumes = heard and self.supervisor.may_resume and not (hindered or self._landed())
         reached = {
             Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
-            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_off(),
+            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_airborne(),
             Event.TIME_UP: state is State.FLY and elapsed >= self.settings.seconds,
-            Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._stands(),
-            Event.RESUMED: state is State.HOLD and self._back.update(resumes, self._now),
+            Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._landed(),
+            Event.RESUMED: state is State.HOLD and self._recovered.update(resumes, self._now),
             Event.GROUNDED: state is State.STOP and elapsed >= times.stop and not flying,
         }
         events = [Fault(event) for event, is_reached in reached.items() if is_reached]
@@ -288,12 +288,12 @@ class Flight:
             known = [Fault(Event.CURVE_KNOWN, "dry run")] if dry else None
             events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
         if elapsed >= self._limit(state):
-            stuck = state is State.RAMP and not self._is_off()
-            text = self._stuck() if stuck else f"{state.value} lasted {elapsed:.1f} s"
+            stuck = state is State.RAMP and not self._is_airborne()
+            text = self._stuck_message() if stuck else f"{state.value} lasted {elapsed:.1f} s"
             events.append(Fault(Event.TIMEOUT, text))
         return events
 
-    def _stuck(self) -> str:
+    def _stuck_message(self) -> str:
         return self._take_off.stuck(self.maps)
 
     def _limit(self, state: State) -> float:
@@ -316,31 +316,31 @@ class Flight:
         self.note("transition", self._now, before=before.state.value, after=entered.value, events=names)
         if entered is State.FLY and before.state is State.RAMP:
             self.controller.reset()
-            self._commands, self._needed = None, self._take_off.needed([one.quaternion for one in self._states])
+            self._commands, self._hover_scale = None, self._take_off.needed([one.quaternion for one in self._states])
         if entered is State.LAND and before.state is not State.HOLD:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
             highest = max(filter(math.isfinite, self._heights), default=0.0)  # the newest height may be the fault
             self._descend_for = self.settings.times.descent_limit(highest)
-            self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
+            self._plan = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._hold(faults)
 
     def _hold(self, faults: list[Fault]) -> None:
         """Plan the thrust until the firmware of a drone that may not hear stops it."""
         self._holds += 1
-        self._back = Sustained(self.settings.limits.fresh)
+        self._recovered = Sustained(self.settings.limits.fresh)
         age = max((value for value in self._ages if math.isfinite(value)), default=0.0)
         if any(fault.event in (Event.UNHEARD, Event.FROZEN) for fault in faults):
             heard = [watch.heard for watch in self._monitor.uplinks if math.isfinite(watch.heard)]
             age = self._now - min(heard, default=self._now)
         self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
         # Gently: a drone that does not hear keeps its thrust, and the other must not descend much faster.
-        self._shares = setpoints.blind_shares(self._last_known_state(), age, self.settings.period, setpoints.GENTLE)
+        self._plan = setpoints.blind_shares(self._last_known_state(), age, self.settings.period, setpoints.GENTLE)
 
     # Output.
 
-    def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+    def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
         state = self.supervisor.state
         if state in GUIDED:
             return [one.setpoint for one in mapped] if mapped else list(self._sent)
@@ -362,7 +362,7 @@ class Flight:
         elif seen is not None:
             share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
-            share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
+            share = self._plan[min(int(self.elapsed / self.settings.period), len(self._plan) - 1)]
         shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
         return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 

@@ -81,7 +81,7 @@ class Journal:
                 while True:
                     records.append(self._queue.get_nowait())
             done = None in records
-            text = "".join(json.dumps(record, default=_plain) + "\n" for record in records if record is not None)
+            text = "".join(json.dumps(record, default=_to_json) + "\n" for record in records if record is not None)
             try:
                 if self._stream is not None and text:
                     self._stream.write(text)
@@ -103,7 +103,7 @@ def _start_recorder(path: Path) -> subprocess.Popen[str]:
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file, start_new_session=True, encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """NumPy arrays and scalars as Python values for JSON."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
@@ -178,9 +178,9 @@ class Tail:
         except ValueError as error:
             self.damaged.append(f"line {self._lines} is damaged: {error}")
             return None
-        return None if record is None or self._misplaces(record) else self._checked(record)
+        return None if record is None or self._is_out_of_order(record) else self._checked(record)
 
-    def _misplaces(self, record: Record) -> bool:
+    def _is_out_of_order(self, record: Record) -> bool:
         """Whether `record` is out of order in its stream. Each stream is written in order, by one thread."""
         if record["kind"] == "header":
             self.misplaced = self.misplaced or f"line {self._lines} begins another log"

@@ -16,8 +16,8 @@ from mjxfly.log_unpack import Unpacking, check_tables
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 BAGS, COMPRESSED = (".mcap", ".db3"), ".zstd"
-CLOCKS = 0.05  # [s] largest median difference between stamps and times of receipt
-ASTRAY = 1  # [s] largest difference of one message: a stamp of 0 means that it has none
+MAX_CLOCK_OFFSET = 0.05  # [s] largest median difference between stamps and times of receipt
+MAX_STAMP_ERROR = 1  # [s] largest difference of one message: a stamp of 0 means that it has none
 SHOWN = 6  # topics named in an error message
 
 
@@ -39,7 +39,7 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
     with tempfile.TemporaryDirectory() as spare, contextlib.ExitStack() as stack:
         try:
             stack.enter_context(unpacking.bounding())
-            files = [_whole(_unpacked(file, Path(spare), unpacking), Path(spare), remark, unpacking) for file in found]
+            files = [_intact(_plain(file, Path(spare), unpacking), Path(spare), remark, unpacking) for file in found]
             with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 return _contents(path, reader, unpacking)
         except InputError:
@@ -69,7 +69,7 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
-def _unpacked(path: Path, spare: Path, unpacking: Unpacking) -> Path:
+def _plain(path: Path, spare: Path, unpacking: Unpacking) -> Path:
     """`path`, or its decompressed copy in the folder `spare`."""
     if path.suffix != COMPRESSED:
         return path
@@ -77,7 +77,7 @@ def _unpacked(path: Path, spare: Path, unpacking: Unpacking) -> Path:
     return spare / path.stem
 
 
-def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Unpacking) -> Path:
+def _intact(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Unpacking) -> Path:
     """`path`, or a copy of the intact part in the folder `spare` if it is a truncated MCAP file."""
     if path.suffix == ".db3":
         check_tables(path)
@@ -88,14 +88,14 @@ def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Un
         if begin != MAGIC:
             what = "is empty" if not begin else f"begins with {begin!r}"
             raise InputError(f"bag {path} {what}; expected an MCAP file, which begins with {MAGIC!r}")
-    if _ends(path):
+    if _has_footer(path):
         return path
     copy = spare / f"whole-{path.name}"
     remark(f"it is cut short, without a footer: {_copy_sound(path, copy, unpacking)} messages are whole")
     return copy
 
 
-def _ends(path: Path) -> bool:
+def _has_footer(path: Path) -> bool:
     """Whether the MCAP file `path` has its closing magic bytes."""
     with path.open("rb") as stream:
         size = stream.seek(0, 2)
@@ -143,16 +143,16 @@ def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
     if f"/{HEADER}" in topics:
         # A bag is sorted by time, and the header need not be its earliest line.
         lines = [
-            part[RECORD] for name in (HEADER, RECORD) for *_, part in _parts(path, reader, unpacking, {f"/{name}"})
+            part[RECORD] for name in (HEADER, RECORD) for *_, part in _messages(path, reader, unpacking, {f"/{name}"})
         ]
         return Found(b"".join(line + b"\n" for line in lines), {}, has)
     found: dict[tuple[str, str, str], tuple[list[float], list[Any]]] = {}
     apart: dict[str, list[float]] = {}
-    wanted = {topic for topic, kind in topics.items() if (one := TOPICS.get(_last(topic))) and one.type == kind}
-    for topic, received, drone, header, values in _parts(path, reader, unpacking, wanted):
+    wanted = {topic for topic, kind in topics.items() if (one := TOPICS.get(_last_part(topic))) and one.type == kind}
+    for topic, received, drone, header, values in _messages(path, reader, unpacking, wanted):
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
-        stamped = abs(received - now) <= ASTRAY * 10**9
+        stamped = abs(received - now) <= MAX_STAMP_ERROR * 10**9
         for quantity, row in values.items():
             _check_width(path, topic, quantity, len(row))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
@@ -162,18 +162,18 @@ def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
     return Found(b"", _densest(found), has)
 
 
-def _last(topic: str) -> str:
+def _last_part(topic: str) -> str:
     return topic.rpartition("/")[2]
 
 
-def _parts(
+def _messages(
     path: Path, reader: Any, unpacking: Unpacking, topics: set[str]
 ) -> Iterator[tuple[str, int, str, Any, dict[str, Any]]]:
     """(topic, time of receipt [ns], drone, header or None, values by quantity) of all messages on `topics`."""
     wanted = [one for one in reader.connections if one.topic in topics]
     for connection, received, raw in reader.messages(wanted) if wanted else ():
         topic = connection.topic
-        known, message = TOPICS[_last(topic)], reader.deserialize(unpacking.message(raw), connection.msgtype)
+        known, message = TOPICS[_last_part(topic)], reader.deserialize(unpacking.message(raw), connection.msgtype)
         try:
             parts = list(known.take(message))
         except AttributeError as error:
@@ -181,23 +181,23 @@ def _parts(
                 f"bag {path}: {known.type} of {topic} has another definition than expected: {error}"
             ) from None
         for drone, header, values in parts:
-            yield topic, received, drone or _last(topic.rpartition("/")[0]), header, values
+            yield topic, received, drone or _last_part(topic.rpartition("/")[0]), header, values
 
 
 def _check_width(path: Path, topic: str, quantity: str, found: int) -> None:
     if found != WIDTHS[quantity]:
         variables = [name for name, one in VARIABLES.items() if one.quantity == quantity]
-        own = [name for name in variables if name.startswith(f"{_last(topic)}.")]
+        own = [name for name in variables if name.startswith(f"{_last_part(topic)}.")]
         raise InputError(f"bag {path}: {topic} has {found} values; expected {', '.join(own)}")
 
 
 def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:
     for topic, differences in apart.items():
         usual = float(np.median(differences))
-        if abs(usual) > CLOCKS:
+        if abs(usual) > MAX_CLOCK_OFFSET:
             raise InputError(
                 f"bag {path} is of two clocks: {topic} is stamped {usual:.3g} s before it was received; expected "
-                f"{CLOCKS:g} s or less, of a recorder on the machine that stamps, or of synchronised clocks"
+                f"{MAX_CLOCK_OFFSET:g} s or less, of a recorder on the machine that stamps, or of synchronised clocks"
             )
 
 

@@ -25,7 +25,7 @@ SPARSE = 2.5  # median steps between two rows that count as a gap in a slower se
 HORIZON = 0.2  # [s] over which motion is compared
 # In 5 s of public flights of one drone over a radio (NanoBench), positions change by 0.94 to 1.21 of the estimated
 # velocities, attitudes by 0.82 to 1.20 of the rates, but never both by more or both by less; lags vary by 0.03 s.
-SURE = 0.8  # least correlation for a ratio to be used
+MIN_CORRELATION = 0.8  # least correlation for a ratio to be used
 SCALE, UNIT = 1.12, 1.35  # factor at which both ratios together, or one alone, count as wrong
 
 GRID = 0.005  # [s]
@@ -70,7 +70,7 @@ class Motion(NamedTuple):
         """Measured over recorded rates, 1 if they do not correlate enough."""
         product = float((self.measured * self.said).sum())
         lengths = float(np.linalg.norm(self.measured)), float(np.linalg.norm(self.said))
-        return lengths[0] / lengths[1] if product > SURE * lengths[0] * lengths[1] > 0 else 1.0
+        return lengths[0] / lengths[1] if product > MIN_CORRELATION * lengths[0] * lengths[1] > 0 else 1.0
 
 
 def way(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Motion:

@@ -34,7 +34,7 @@ ABOUT = ("policy", "version", "config_hash", "mocap", "curve", "command")  # fie
 CHUNK_PERIOD = 0.25  # [s] between two chunks of an MCAP file while it is recorded
 
 
-class _Whole:
+class _CommittedFile:
     """A file whose tail after the last `flush` is overwritten by the next `commit`.
 
     A commit is a single write, so that a killed process leaves a complete file.
@@ -66,7 +66,7 @@ class Recorder(Encoder):
 
     def __init__(self, stream: BinaryIO):
         """Write to `stream`, which can seek. Raises InputError without mcap-ros2-support."""
-        self._file = _Whole(stream)
+        self._file = _CommittedFile(stream)
         super().__init__(self._begun())
 
     def _begun(self) -> Any:

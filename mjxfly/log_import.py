@@ -28,7 +28,7 @@ from mjxfly.supervisor import State
 from mjxfly.telemetry import Rig
 
 UNKNOWN = "an unknown follower"  # policy name of a flight that another program recorded
-DIFFERENT = 0.5  # largest deviation of the drones' relative position from the rig's, over its length
+MAX_DEVIATION = 0.5  # largest deviation of the drones' relative position from the rig's, over its length
 
 
 def is_foreign(path: Path) -> bool:
@@ -99,7 +99,7 @@ def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -
     (one, first), (other, second) = whole.items()
     apart = _from_each_other(first, second)
     sides = [float(np.linalg.norm(sign * apart - rig.span)) for sign in (1.0, -1.0)]
-    if min(sides) > DIFFERENT * np.linalg.norm(rig.span):
+    if min(sides) > MAX_DEVIATION * np.linalg.norm(rig.span):
         raise InputError(
             f"bag {path}: {one} is {_vector_text(apart)} m from {other}; expected {_vector_text(rig.span)}, as leader "
             "and follower are on this rig: name another with --plant, or call the drones so"

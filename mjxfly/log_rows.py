@@ -29,7 +29,7 @@ UNITS = {
 }
 AXES = ("the world's axes", "the drone's axes")
 USUAL = {"velocity": AXES[0], "along": AXES[1], "rates": AXES[1]}  # usual axes of quantities that poses can verify
-WRONG = 0.7  # largest error of a recorded motion over the measured one; 0.2 to 0.4 in public flights (NanoBench)
+MAX_ERROR = 0.7  # largest error of a recorded motion over the measured one; 0.2 to 0.4 in public flights (NanoBench)
 
 Drone = dict[str, Samples]  # by quantity
 
@@ -73,11 +73,11 @@ def _sound_rows(quantity: str, time: np.ndarray, rows: np.ndarray) -> np.ndarray
         good[good] = np.abs(np.linalg.norm(rows[good], axis=1) - 1) <= UNEVEN
     if quantity == "position":
         kept = np.flatnonzero(good)
-        good[kept[_elsewhere(time[kept], rows[kept])]] = False
+        good[kept[_leaps(time[kept], rows[kept])]] = False
     return good
 
 
-def _elsewhere(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+def _leaps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     """(n,) where a position leaps away and comes back within `LOST`, as if a tracker mistook another body for it."""
     away = np.zeros(len(time), bool)
 
@@ -114,7 +114,7 @@ def _in_axes(path: Path, own: Drone, quantity: str, name: str, remark: Callable[
     options = {axes: rows if (axes == AXES[1]) == (quantity == "rates") else turned for axes in AXES}
     motions = {axes: held(values) for axes, values in options.items()}
     unit, least = ("rad/s", 0.05) if quantity == "rates" else ("m/s", 0.02)  # errors below `least` are noise
-    most = max(2 * least, WRONG * motions[usual].size)
+    most = max(2 * least, MAX_ERROR * motions[usual].size)
     errors = {axes: f"{one.error:.2g} {unit}" for axes, one in motions.items()}
     if min(one.error for one in motions.values()) > most:
         ratios = [one.ratio for one in motions.values()]

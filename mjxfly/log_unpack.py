@@ -12,10 +12,11 @@ from typing import Any, BinaryIO
 
 from mjxball.errors import InputError
 
-TIMES, ALWAYS, DISK = 100, 16 * 2**20, 2**32  # limit over a bag's size; least limit [bytes]; of copies on disk [bytes]
-PACKED = b"\x28\xb5\x2f\xfd"  # first bytes of zstd data
-PIECE = 2**20  # [bytes] unpacked at once
-DEFINED = 2**20  # largest size of all message definitions [characters]; the parser reads about 50 000 a second
+MAX_RATIO, MIN_LIMIT = 100, 16 * 2**20  # largest decompressed size over a bag's own; least such limit [bytes]
+MAX_COPIED = 2**32  # [bytes] of decompressed copies on disk
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # first bytes of zstd data
+CHUNK = 2**20  # [bytes] unpacked at once
+MAX_TEXT = 2**20  # largest size of all message definitions [characters]; the parser reads about 50 000 a second
 
 Unpack = Callable[[bytes], bytes]
 
@@ -24,16 +25,16 @@ class Unpacking:
     """Decompresses parts of the bag `path` of `size` bytes and bounds the total size of the results."""
 
     def __init__(self, path: Path, size: int):
-        self._path, self._limit = path, max(ALWAYS, TIMES * size)
+        self._path, self._limit = path, max(MIN_LIMIT, MAX_RATIO * size)
         self._left, self._copied, self._defined = self._limit, 0, 0
 
     def refuse(self) -> None:
         """Raise InputError if a limit is exceeded. Every method that decompresses calls it."""
-        if self._left < 0 or self._copied > DISK:
-            most = min(self._limit, DISK) if self._copied > DISK else self._limit
+        if self._left < 0 or self._copied > MAX_COPIED:
+            most = min(self._limit, MAX_COPIED) if self._copied > MAX_COPIED else self._limit
             raise InputError(
-                f"bag {self._path} unpacks to more than {most >> 20} MiB; expected at most {TIMES} times its own size, "
-                f"or {ALWAYS >> 20} MiB"
+                f"bag {self._path} unpacks to more than {most >> 20} MiB; expected at most {MAX_RATIO} times its own "
+                f"size, or {MIN_LIMIT >> 20} MiB"
             )
 
     def plain(self, data: bytes) -> bytes:
@@ -48,7 +49,7 @@ class Unpacking:
 
     def message(self, data: bytes) -> bytes:
         """`data`, decompressed if the recorder compressed single messages; no CDR message begins like zstd data."""
-        return self.zstd(data) if data[: len(PACKED)] == PACKED else data
+        return self.zstd(data) if data[: len(ZSTD_MAGIC)] == ZSTD_MAGIC else data
 
     def lz4(self, data: bytes) -> bytes:
         """The decompressed frame `data`. Raises ValueError if it is incomplete."""
@@ -56,7 +57,7 @@ class Unpacking:
 
         frame, parts = lz4.frame.LZ4FrameDecompressor(), list[bytes]()
         while not frame.eof:
-            parts.append(self.plain(frame.decompress(data, max_length=PIECE)))
+            parts.append(self.plain(frame.decompress(data, max_length=CHUNK)))
             data = b""
             if frame.needs_input and not parts[-1]:
                 raise ValueError("a chunk is cut short")
@@ -104,13 +105,13 @@ class Unpacking:
             yield
 
     def _defining(self, parse: Callable[..., Any]) -> Callable[..., Any]:
-        """`parse`, a parser of message definitions, limited to `DEFINED` characters in total."""
+        """`parse`, a parser of message definitions, limited to `MAX_TEXT` characters in total."""
 
         def counted(text: str, *given: Any) -> Any:
             self._defined += len(text)
-            if self._defined > DEFINED:
+            if self._defined > MAX_TEXT:
                 raise InputError(
-                    f"bag {self._path} defines its messages in more than {DEFINED >> 20} MiB; expected those of ROS 2"
+                    f"bag {self._path} defines its messages in more than {MAX_TEXT >> 20} MiB; expected those of ROS 2"
                 )
             return parse(text, *given)
 
@@ -124,7 +125,7 @@ class Unpacking:
         import zstandard
 
         with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True, closefd=False) as stream:
-            while piece := stream.read(PIECE):
+            while piece := stream.read(CHUNK):
                 yield self.plain(piece)
 
 

@@ -49,7 +49,7 @@ from mjxfly.uri import HERE, Udp, Uri, check_pair, parse_uri, share_dongle
 SLOW = ("slow", 1.0, clock.SLOWEST)
 # Flags with their bounds: battery, and the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
-WORSE = {  # impairments of the link once the motors turn: cflib connects over a good link only
+IMPAIRMENTS = {  # impairments of the link once the motors turn: cflib connects over a good link only
     "loss": "share of lost datagrams",
     "delay": "seconds that each is late",
     "jitter": "seconds more, at random",
@@ -118,7 +118,7 @@ def make_parser() -> cli.Parser:
     about = f"--rehearse: after S seconds with motors on; may be repeated: {kinds}"
     twin.add_argument("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=about)
     for name, _, high in LINK[1:]:
-        about = f"--rehearse: {WORSE[name]}, up to {high:g}"
+        about = f"--rehearse: {IMPAIRMENTS[name]}, up to {high:g}"
         twin.add_argument(f"--{name}", type=float, metavar="X", help=about)
     add_twin_options(twin)
     rare.update(flag for group in (thrust, twin) for action in group._group_actions for flag in action.option_strings)
@@ -240,7 +240,7 @@ def check_log(log: Path, viewed: bool) -> None:
 
 def check_twin_options(options: argparse.Namespace) -> None:
     """Raise InputError for invalid flags of a rehearsal or of --onboard."""
-    own = [f"--{name}" for name in (*WORSE, "fault", "slow") if getattr(options, name)]
+    own = [f"--{name}" for name in (*IMPAIRMENTS, "fault", "slow") if getattr(options, name)]
     given = [*own, *given_twin_options(options)]
     if given and not options.rehearse:
         raise InputError(f"{given[0]} is for --rehearse only")
@@ -269,7 +269,7 @@ def rehearsed_options(options: argparse.Namespace) -> list[str]:
 
 def twin_options(options: argparse.Namespace) -> list[str]:
     """The twin's flags for link, faults, drones and surroundings."""
-    worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
+    worse = [f"--{name}={getattr(options, name)}" for name in IMPAIRMENTS if getattr(options, name) is not None]
     return [*worse, *(f"--fault={fault}" for fault in options.fault), *given_twin_options(options)]
 
 

@@ -67,7 +67,7 @@ class Repeats:
 WINDOW = 1.2  # [s] over which rotations and displacements are compared
 TURN = 0.035  # [rad] by which the measured rotation may differ from the gyroscope's
 LATE = 0.04  # [s] by which the measured attitude may lag the gyroscope
-WAY, BIAS, DOUBT = 0.012, 0.1, 4.0  # tolerance of displacements, see `ImuWatch._felt`: [m], [m/s2], standard deviations
+SHIFT, BIAS, SIGMAS = 0.012, 0.1, 4.0  # tolerance of displacements [m], [m/s2], standard deviations: `ImuWatch._felt`
 CONTRADICTING = 0.1  # [s] for which they must differ
 TURNED, MOVED = math.radians(10), 0.1  # [rad] and [m] about and along an axis in the window that verify the axis
 
@@ -89,7 +89,7 @@ class ImuWatch:
 
     def __init__(self, axes: Sequence[int] = (0, 1, 2), noise: float = 0.0):
         """`axes` of the world that are compared; `noise` [m] of positions beyond that of motion capture."""
-        self._axes, self._way = list(axes), WAY + DOUBT * math.sqrt(6) * noise  # of a second difference
+        self._axes, self._tolerance = list(axes), SHIFT + SIGMAS * math.sqrt(6) * noise  # of a second difference
         self._moments: collections.deque[_Moment] = collections.deque()
         self._turned = np.array([1.0, 0.0, 0.0, 0.0])
         self._state: Sample | None = None
@@ -183,9 +183,9 @@ class ImuWatch:
         noise = math.sqrt(0.5 * float(np.square(np.diff(felt, axis=0)).sum(axis=1).mean()))
         step = (end - begin) / max(len(seen) - 1, 1)
         limit = (
-            self._way
+            self._tolerance
             + BIAS * float(share.sum()) * step
-            + DOUBT * noise * step * math.sqrt(float(np.square(share).sum()))
+            + SIGMAS * noise * step * math.sqrt(float(np.square(share).sum()))
         )
         return np.trapezoid(share * felt, times, axis=0), limit
 

@@ -26,12 +26,12 @@ JUMP = 0.08  # of the position, beyond what its velocity explains [m]
 JUMP_TIME = 0.1  # longest step between two states that is checked for a jump [s]
 HEIGHT, CLIMB = 0.05, 0.3  # difference between both drones' heights [m] and climbs [m/s], corrected for the attitude
 LASTING = 0.25  # [s] for which heights or climbs must disagree
-APART, DOUBT = 0.015, 4.0  # change of their relative position along an axis: [m], and in standard deviations
-USUAL = 10.0  # [s] time constant of the mean that this change is measured from
+APART, SIGMAS = 0.015, 4.0  # change of their relative position along an axis: [m], and in standard deviations
+MEAN_TIME = 10.0  # [s] time constant of the mean that this change is measured from
 LIMITS = Limits()
 ECHO = 0.3  # [s] within which a sent thrust is reported back as the one in force
 RECENT = 0.1  # [s] of sent thrusts with which a constant thrust in force is compared
-SAME = 1.5  # [thrust units] rounding tolerance between two equal thrusts
+ROUNDING = 1.5  # [thrust units] rounding tolerance between two equal thrusts
 CLOSED = (State.RAMP, *GUIDED)  # the thrust depends on the estimates; before, the streams of a pair at rest may freeze
 # [s] after CLOSED in which a stream may freeze by the same cause. Later a frozen estimate still steers a descent better
 # than none, since the blind descent would start in its middle.
@@ -96,7 +96,7 @@ class Monitor:
     def __init__(self, rig: Rig, settings: FlightSettings):
         self._rig, self._settings = rig, settings
         bounds = settings.limits
-        self._held = dataclasses.replace(bounds, tilt=min(bounds.hold_tilt, bounds.tilt))
+        self._hold_limits = dataclasses.replace(bounds, tilt=min(bounds.hold_tilt, bounds.tilt))
         self._low = [Sustained(bounds.battery_time) for _ in NAMES]
         self.origin = np.zeros(3)  # where O stood at the start [m]
         self.estimators = EstimatorWatch(rig, not settings.stand, bounds)
@@ -104,14 +104,14 @@ class Monitor:
         self._drones = [DroneWatch(axes, bounds.noise) for _ in NAMES]
         self.uplinks = [UplinkWatch(name) for name in NAMES]
         self.object: ObjectState | None = None  # newest trusted state
-        self._closed = -math.inf  # [s] last time in a state of `CLOSED`
+        self._closed_at = -math.inf  # [s] last time in a state of `CLOSED`
 
     def update(self, phase: State, links: Sequence[DroneLink], ages: Sequence[float], now: float) -> list[Fault]:
         """Faults in the supervisor's state `phase` at `now` [s]; `ages` (2,) [s] are those of the states."""
         samples = [link.telemetry.newest for link in links if link.telemetry.newest is not None]
         healths = [link.telemetry.health for link in links]
         fresh = [age <= self._settings.limits.state_age for age in ages]
-        self._closed = now if phase in CLOSED else self._closed
+        self._closed_at = now if phase in CLOSED else self._closed_at
         dry, faults = self._settings.dry_run, self._measured(phase, links, now)
         if phase in AIRBORNE and all(fresh):
             faults += self.estimators.update(samples, [one and one.health for one in healths], now)
@@ -120,7 +120,7 @@ class Monitor:
                 found = watch.update(*health) if health is not None else []
                 faults += [watch.frozen] if found and drone.stands(FROZEN) else found
         self.object = self.estimators.object(samples, fresh) or self.object
-        bounds = self._held if phase is State.HOLD else self._settings.limits
+        bounds = self._hold_limits if phase is State.HOLD else self._settings.limits
         states = [sample.state for sample in samples]
         for name, state, known in zip(NAMES, states, fresh, strict=True):
             faults += self._from_state(name, state, bounds, phase not in ON_GROUND and not dry) if known else []
@@ -145,7 +145,7 @@ class Monitor:
             if sensed is not None:
                 repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
                 still = still or repeated
-            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and now - self._closed <= TOGETHER else []
+            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and now - self._closed_at <= TOGETHER else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
             if self._settings.dry_run:  # carried by hand it can contradict its IMU, but at rest its streams may freeze
                 own = [fault for fault in own if fault.event is Event.FRAME]
@@ -176,10 +176,10 @@ class EstimatorWatch:
         self._rig, self._limits = rig, limits
         self._axes = (0, 1, 2) if sideways else (2,)
         self._before: list[Sample | None] = [None, None]
-        self._height, self._climb, self._apart = Sustained(LASTING), Sustained(LASTING), Sustained(REPEATING)
-        self._usual: np.ndarray | None = None  # (3,) slow mean of the leader's error against follower and stick [m]
-        self._at = 0.0  # [s] time of that mean
-        self._doubt = np.zeros(3)  # (3,) standard deviation of the relative position, by the filters' variances [m]
+        self._height, self._climb, self._relative = Sustained(LASTING), Sustained(LASTING), Sustained(REPEATING)
+        self._mean: np.ndarray | None = None  # (3,) slow mean of the leader's error against follower and stick [m]
+        self._mean_time = 0.0  # [s] time of that mean
+        self._spread = np.zeros(3)  # (3,) standard deviation of the relative position, by the filters' variances [m]
         self.trusted = [True, True]
         self.contradiction = False  # the estimates contradict each other, and it is unknown which one is wrong
 
@@ -192,7 +192,7 @@ class EstimatorWatch:
                 self.trusted[number] = False
                 found.append(Fault(Event.ESTIMATOR, f"{NAMES[number]}: {reason}"))
         known = [health.variance for health in healths if health is not None]
-        self._doubt = np.sqrt(np.sum(known, axis=0)) if known else self._doubt
+        self._spread = np.sqrt(np.sum(known, axis=0)) if known else self._spread
         if all(self.trusted):
             found += self._against_each_other(samples, now)
         return found
@@ -228,12 +228,12 @@ class EstimatorWatch:
         faster = float((leader.velocity - follower.velocity - matrix @ turning)[2])
         details = {
             f"the leader's height is {100 * beside[2]:+.0f} cm from where the follower and the roll put it": (
-                self._height.update(abs(beside[2]) > max(HEIGHT, DOUBT * math.sqrt(2) * self._limits.noise), now)
+                self._height.update(abs(beside[2]) > max(HEIGHT, SIGMAS * math.sqrt(2) * self._limits.noise), now)
             ),
             f"the leader climbs {faster:+.1f} m/s against the follower": self._climb.update(abs(faster) > CLIMB, now),
         }
         apart = self._moved_apart(beside, now)
-        details[f"the leader moved {1000 * apart:.0f} mm from where the stick puts it"] = self._apart.update(
+        details[f"the leader moved {1000 * apart:.0f} mm from where the stick puts it"] = self._relative.update(
             apart > 0, now
         )
         found = [Fault(Event.ESTIMATOR, detail) for detail, holds in details.items() if holds][:1]
@@ -245,12 +245,12 @@ class EstimatorWatch:
 
         The change is from a slow mean: a constant error, of the frames or mounts, is no fault.
         """
-        if self._usual is None:
-            self._usual, self._at = beside, now
-        moved = beside - self._usual
-        self._usual = self._usual - math.expm1((self._at - now) / USUAL) * moved
-        self._at = now
-        beyond = np.abs(moved)[list(self._axes)] > np.maximum(APART, DOUBT * self._doubt[list(self._axes)])
+        if self._mean is None:
+            self._mean, self._mean_time = beside, now
+        moved = beside - self._mean
+        self._mean = self._mean - math.expm1((self._mean_time - now) / MEAN_TIME) * moved
+        self._mean_time = now
+        beyond = np.abs(moved)[list(self._axes)] > np.maximum(APART, SIGMAS * self._spread[list(self._axes)])
         return float(np.abs(moved)[list(self._axes)].max()) if beyond.any() else 0.0
 
     def object(self, samples: Sequence[Sample], fresh: Sequence[bool]) -> ObjectState | None:
@@ -309,10 +309,10 @@ class UplinkWatch:
         while self._sent and self._sent[0][0] < arrival - ECHO:
             self._sent.popleft()
         moved, self._before = health.thrust != self._before, health.thrust
-        times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < SAME]
+        times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < ROUNDING]
         recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
         # A constant thrust in force is right if most recent ones were equal to it, as at a bound; else one was lost.
-        usual = sum(abs(thrust - health.thrust) < SAME for thrust in recent) >= len(recent) / 2
+        usual = sum(abs(thrust - health.thrust) < ROUNDING for thrust in recent) >= len(recent) / 2
         self.hears = bool(times) and (moved or usual)
         if self.hears:
             self._missing, self.heard = 0, max(self.heard, times[-1])

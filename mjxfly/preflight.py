@@ -120,7 +120,7 @@ def promised_curve(link: Link, own: Variants) -> CurveName:
         return known or first
     raise LinkError(
         f"the firmware {link.identity.version} of the {link.name} has the {known} force curve, "
-        f"and this flight has gains for the {first} one only: {OTHER}"
+        f"and this flight has gains for the {first} one only: {CURVE_REMEDY}"
     )
 
 
@@ -164,7 +164,7 @@ def reset_estimator(link: Link, required: Preflight) -> None:
         good = good + 1 if min(sample.health.variance) > 0 and found < required.variance else 0
 
 
-def _ready(info: int) -> bool:
+def _can_start(info: int) -> bool:
     return bool(info & (packets.CAN_ARM | packets.CAN_FLY)) and not info & packets.FLYING
 
 
@@ -173,7 +173,7 @@ def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
 
     def settled() -> bool:
         infos = [link.telemetry.newest.state.info for link in links if link.telemetry.newest is not None]
-        return all(_ready(info) or down_reason(info, armed=False) for info in infos)
+        return all(_can_start(info) or down_reason(info, armed=False) for info in infos)
 
     wait_until(settled, seconds)
 
@@ -193,7 +193,7 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
         state, age = sample.state, link.telemetry.age(now)
         states.append(state)
         refusal = down_reason(state.info, armed=False)
-        can = _ready(state.info)
+        can = _can_start(state.info)
         tilt, yaw = tilt_angle(state.quaternion), yaw_of(state)
         fresh, alive = rate >= required.rate, refusal or ("can fly" if can else "cannot arm")
         rows: tuple[tuple[str, bool, str, str], ...] = (
@@ -209,7 +209,7 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
     return [*checks, heading_check(states, required), stick_check(states, rig, bounds, required)]
 
 
-OTHER = "leave --curve out, or take other firmware or another policy"
+CURVE_REMEDY = "leave --curve out, or take other firmware or another policy"
 BUSY = "take a free radio channel, come closer, end other programs"
 TURNED = "turn it, or its body in the cameras' program, to look along +x"
 YAW_COST = 6  # [mm] of hover error for each degree between both yaws: 29 mm for 5 on the real firmware
@@ -256,8 +256,8 @@ def stick_check(states: Sequence[DroneState], rig: Rig, bounds: Limits, required
 
 
 COMPENSATES_SINCE = (2025, 12)  # first version of the released firmware with battery compensation
-LIKELY = 0.12  # largest |ln(PWM / expected PWM)|: half the difference between the two curves at a full battery
-WANTED = 3  # consecutive health packets that must agree
+MAX_LOG_RATIO = 0.12  # largest |ln(PWM / expected PWM)|: half the difference between the two curves at a full battery
+AGREEING = 3  # consecutive health packets that must agree
 RESERVE = 0.97  # of the largest thrust command, above which a pair has no reserve to hover
 
 
@@ -281,7 +281,7 @@ def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
     expected = {"linear": compensated, "older": thrust}
     off = {name: abs(math.log(pwm / value)) if value > 0 else math.inf for name, value in expected.items()}
     best = min(CURVE_NAMES, key=lambda name: off[name])
-    return best if off[best] < LIKELY else None
+    return best if off[best] < MAX_LOG_RATIO else None
 
 
 class SpinCheck:
@@ -295,7 +295,7 @@ class SpinCheck:
         self._seen: list[list[CurveName | None]] = [[], []]
         self._last = [0.0, 0.0]
         self._decided = [False, False]
-        self._unfit: list[str] = []
+        self._failures: list[str] = []
 
     def chosen(self) -> tuple[Variant, Variant]:
         """Command map and gains of leader and follower, by the curves known so far."""
@@ -306,10 +306,10 @@ class SpinCheck:
         """Check health packets after `since` [s], when the motors had settled; return events once both are known."""
         for number in range(2):
             if not self._decided[number]:
-                self._look(number, since, now, note)
+                self._check_health(number, since, now, note)
         failed = [link.busy for link in self._links if isinstance(link.busy, str)]
-        if failed or self._unfit:
-            return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._unfit)]
+        if failed or self._failures:
+            return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._failures)]
         if not all(self._decided):
             return []
         heavy = []
@@ -322,20 +322,20 @@ class SpinCheck:
             return heavy
         return [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
 
-    def _look(self, number: int, since: float, now: float, note: Note) -> None:
+    def _check_health(self, number: int, since: float, now: float, note: Note) -> None:
         telemetry, seen = self._links[number].telemetry, self._seen[number]
         sample, state = telemetry.health, telemetry.newest
         if sample is None or state is None or sample.arrival <= max(since, self._last[number]):
             return
         self._last[number] = sample.arrival
-        if not any(sample.health.motors) and len(seen) < 2 * WANTED:
+        if not any(sample.health.motors) and len(seen) < 2 * AGREEING:
             seen.append(None)  # not listed by this firmware, or not turning yet
             return
         found = recognise(sample.health, state.state.battery, self._motor)
         seen.append(found)
-        if found is not None and seen[-WANTED:] == [found] * WANTED:
+        if found is not None and seen[-AGREEING:] == [found] * AGREEING:
             self._decide(number, found, now, note, True)
-        elif len(seen) >= 4 * WANTED:  # neither fits: keep the assumed curve
+        elif len(seen) >= 4 * AGREEING:  # neither fits: keep the assumed curve
             self._decide(number, self.curves[number], now, note, False)
 
     def _decide(self, number: int, curve: CurveName, now: float, note: Note, recognised: bool) -> None:
@@ -343,7 +343,7 @@ class SpinCheck:
         changed = curve != self.curves[number]
         if curve not in self._variants[number]:
             text = f"the {NAMES[number]} has the {curve} force curve, which this flight has no gains for"
-            self._unfit.append(f"{text}: {OTHER}")
+            self._failures.append(f"{text}: {CURVE_REMEDY}")
         elif changed:
             self.curves[number] = curve
             self._links[number].write_later(self._variants[number][curve].gains)

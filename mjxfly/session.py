@@ -38,7 +38,7 @@ from mjxfly.twin.drone import only_kept
 from mjxfly.warm_up import warm_up
 from mjxfly.watchdog import NOTHING, Watchdog
 
-SAVING = 0.2  # [s] to save the log of a program that failed in the air: the watchdog needs its radio
+SAVE_TIME = 0.2  # [s] to save the log of a program that failed in the air: the watchdog needs its radio
 SWITCH_INTERVAL = 5e-4  # [s] between switches of Python threads; the default of 5 ms is half a tick
 
 
@@ -173,7 +173,7 @@ def _leave(flight: Flight, error: BaseException, save: Callable[[], None], resto
         if flight.watchdog is not None:
             flight.watchdog.leave()
             others = "the watchdog brings both drones down"
-        bounded(save, SAVING)
+        bounded(save, SAVE_TIME)
         restore()
         terminal.warn(f"error: the flight program failed in the air, {others}: {type(error).__name__}: {error}")
     finally:

@@ -191,12 +191,12 @@ def take_over(uris: Sequence[str], left: tuple[LastKnownState, float], rehearses
     for thread in threads:
         thread.start()
     if left[1] >= SILENCE:
-        warn(told(left[1], rehearses))
+        warn(hang_message(left[1], rehearses))
     for thread in threads:
         thread.join(timeout=clock.real(OPENING + 5))
 
 
-def told(silent: float, rehearses: bool) -> str:
+def hang_message(silent: float, rehearses: bool) -> str:
     """Message on a flight process that was `silent` for so long [s]."""
     if rehearses:
         return clock.too_slow(f"the flight process stood still for {silent:.2f} s")
