@@ -27,7 +27,7 @@ JUMP_TIME = 0.1  # longest step between two states that is checked for a jump [s
 HEIGHT, CLIMB = 0.05, 0.3  # difference between both drones' heights [m] and climbs [m/s], corrected for the attitude
 LASTING = 0.25  # [s] for which heights or climbs must disagree
 APART, SIGMAS = 0.015, 4.0  # change of their relative position along an axis: [m], and in standard deviations
-MEAN_TIME = 10.0  # [s] time constant of the mean that this change is measured from
+USUAL = 10.0  # [s] time constant of the mean that this change is measured from
 LIMITS = Limits()
 ECHO = 0.3  # [s] within which a sent thrust is reported back as the one in force
 RECENT = 0.1  # [s] of sent thrusts with which a constant thrust in force is compared
@@ -248,7 +248,7 @@ class EstimatorWatch:
         if self._mean is None:
             self._mean, self._mean_time = beside, now
         moved = beside - self._mean
-        self._mean = self._mean - math.expm1((self._mean_time - now) / MEAN_TIME) * moved
+        self._mean = self._mean - math.expm1((self._mean_time - now) / USUAL) * moved
         self._mean_time = now
         beyond = np.abs(moved)[list(self._axes)] > np.maximum(APART, SIGMAS * self._spread[list(self._axes)])
         return float(np.abs(moved)[list(self._axes)].max()) if beyond.any() else 0.0
