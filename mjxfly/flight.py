@@ -202,6 +202,7 @@ class Flight:
         return self._monitor.object if any(self._monitor.estimators.trusted) else None
 
     def _landed(self) -> bool:
+        """True if the pair is near the ground and has stopped sinking; without an estimate by the time of the plan."""
         seen, times = self._trusted(), self.settings.times
         if seen is None:  # no trusted estimate: assume it once the planned blind descent and a margin have passed
             return self.elapsed >= len(self._plan) * self.settings.period + times.settled
@@ -341,6 +342,7 @@ class Flight:
     # Output.
 
     def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+        """Setpoints of leader and follower in the supervisor's state; `mapped` are those of the controllers."""
         state = self.supervisor.state
         if state in GUIDED:
             return [one.setpoint for one in mapped] if mapped else list(self._sent)
@@ -367,6 +369,7 @@ class Flight:
         return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
+        """Update the hover thrusts, and send setpoints and the commands of the supervisor's state."""
         state, dry = self.supervisor.state, self.settings.dry_run
         if state is State.RAMP:
             rises = zip(wanted, self.maps, strict=True)
