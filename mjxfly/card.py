@@ -72,9 +72,7 @@ def goal_of(config: Config) -> tuple[float, float, float]:
 
 
 def times_of(config: Config) -> Times:
-    """Durations of the flight's states. With the paper's thrust map the pair follows a sinking goal too weakly to wait
-    for it, so LAND ends as the goal reaches the ground.
-    """
+    """Durations of the states. With the paper's thrust map a pair follows a sinking goal too weakly to wait for it."""
     return Times(land_spare=0.0) if config.autopilot.thrust_law == "paper" else Times()
 
 
