@@ -1,9 +1,9 @@
-"""Laptop runner for two Crazyflies and a software twin of the pair. No JAX; MuJoCo in `twin.coupled` alone.
+"""Laptop flight program for two Crazyflies, and a software twin of the pair. No JAX; MuJoCo in `twin.coupled` alone.
 
-The way of the data: `packets` (bytes <-> SI) -> `link` (one drone over cflib) -> `telemetry` (object's state from both)
--> `card` (policy's card, leader PID and follower policy) -> `command` (thrust units) and `monitor` (what is wrong)
--> `supervisor` (pure table of states) -> `flight` (one tick) -> `session` (threads, clocks, printing) -> `main`.
-`flight_log` and `recording` read a log back; the commands `log` and `view` show it, and `rig` computes gains and
-identifies the rig from it. `app` makes the same laws apps of the firmware. Files, clocks, sockets and printing live at
-the edges.
+Data flow: `packets` (bytes <-> SI) -> `link` (one drone over cflib) -> `telemetry` (state of the object from both)
+-> `card` (policy metadata; leader PID and follower policy) -> `setpoints` (thrust units) and `monitor` (faults)
+-> `supervisor` (pure state machine) -> `flight` (one tick) -> `session` (threads, clocks, printing) -> `main`.
+`flight_log` and `recording` read a log back. The commands `log` and `view` show it; `rig` computes gains and identifies
+the rig from it. `app` builds the same controllers as apps of the firmware. Files, clocks, sockets and printing stay at
+the edges. O is the object's reference point, the origin of its body frame.
 """

@@ -8,10 +8,10 @@ from mjxfly.main import main
 
 
 def run() -> int:
-    """Fly; return the exit code, or end the process with it."""
+    """Run `main`; return its exit code, or end the process with it if threads of cflib are left."""
     code = main()
     stuck = [thread for thread in threading.enumerate() if not thread.daemon and thread is not threading.main_thread()]
-    if stuck:  # cflib's threads of a dead link may wait for each other for ever; everything of ours is closed
+    if stuck:  # after a dead link cflib's threads may deadlock; ours have ended
         sys.stderr.flush()
         os._exit(code)
     return code

@@ -1,7 +1,7 @@
-"""A flight whose laws run on the drones: the laptop arms, says which phase it wants, watches, logs and lands.
+"""A flight whose controllers run on the drones. The laptop arms, requests phases, monitors, logs and lands.
 
-The supervisor's states are the same. In the air the apps decide (`mjxfly.app`): they land by themselves if they do
-not hear the laptop or each other, so that nothing is held here for a link that breaks off.
+The supervisor has the same states. In the air the apps (`mjxfly.app`) decide: they land by themselves if they do not
+hear the laptop or each other, so the laptop does not enter HOLD when a link breaks.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from mjxfly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, State
 from mjxfly.takeoff import STUCK
 from mjxfly.telemetry import DroneLink, Rig, object_state
 
-STATE_AGE = 0.5  # [s]: from here on the laptop lands, as the apps do when they have not heard it for as long
+STATE_AGE = 0.5  # [s] age of a state at which the laptop lands; the apps land after the same silence
 PERIOD = 2  # ticks between two orders
 
 
 @dataclass(frozen=True)
 class Apps:
-    """What is expected on board."""
+    """The apps that the drones are expected to carry."""
 
     name: str  # of the policy
-    idents: Sequence[int]  # of its weights, in float32 and in 8 bits
-    period: int  # of its law [ms]
-    upload: tuple[bytes, int] | None = None  # weights and key, to be put into the follower
+    idents: Sequence[int]  # identifiers of its weights in float32 and in int8
+    period: int  # control period [ms]
+    upload: tuple[bytes, int] | None = None  # weights and key to upload to the follower
 
     def check(self, number: int, link: Link, say: Callable[[str], None]) -> None:
-        """See that drone `number` carries its app of this policy; upload weights if wanted. Raises InputError."""
+        """Check that drone `number` carries its app of this policy; upload weights if given. Raises InputError."""
         found = self._read(link, ("role", "period"))
         if int(found["role"]) != number:
             raise InputError(f"the {link.name} carries the app of the {NAMES[1 - number]}; exchange the URIs")
@@ -68,7 +68,7 @@ class Apps:
 
 
 def check_ready(link: Link) -> Check:
-    """Whether the app would begin a flight; that the firmware cannot fly yet is the firmware's check."""
+    """Whether the app would start a flight. `CANNOT_FLY` passes: the check of the firmware covers it."""
     app = link.telemetry.app
     refusal = None if app is None else reason(app.refusal)
     ready = refusal in (reason(0), CANNOT_FLY)
@@ -76,7 +76,7 @@ def check_ready(link: Link) -> Check:
 
 
 def send_weights(link: Link, weights: bytes, key: int, say: Callable[[str], None]) -> None:
-    """Put `weights` into the follower at `link`, on the ground. Raises InputError if its app refuses them."""
+    """Upload `weights` to the follower at `link`, on the ground. Raises InputError if its app refuses them."""
     for packet in upload(weights, key):
         reply = link.ask_app(packet)
         if reply.status:
@@ -94,51 +94,51 @@ ORDERS = {
     State.STOP: Phase.STOP,
     State.KILL: Phase.STOP,
 }
-# What an app's phase says to a laptop that is in command of the laws, or has them land.
-NEWS = {
+# Event for a phase that an app enters by itself, while the laptop flies or lands.
+PHASE_EVENTS = {
     Phase.LAND: Event.APP_LANDS,
     Phase.DESCEND: Event.APP_DESCENDS,
     Phase.STOP: Event.APP_STOPS,
     Phase.IDLE: Event.APP_STOPS,
 }
-LANDED = (reason(1), reason(2), reason(18))  # of a stop that was asked for, or follows from standing on the ground
-# What the apps see to, or what has no meaning without setpoints of the laptop's.
-THEIRS = (Event.UNHEARD, Event.DEADLINES, Event.SATURATED, Event.GAPS)
+LANDED = (reason(1), reason(2), reason(18))  # causes of a stop that was requested, or that follows a touchdown
+# Events that the apps handle, or that only apply to setpoints sent by the laptop.
+HANDLED_BY_APPS = (Event.UNHEARD, Event.DEADLINES, Event.SATURATED, Event.GAPS)
 
 
 def settings_of(settings: FlightSettings) -> FlightSettings:
-    """`settings` for a flight on board."""
+    """`settings` of a flight on board: states may be up to `STATE_AGE` old."""
     return replace(settings, limits=replace(settings.limits, state_age=STATE_AGE))
 
 
 def variants_of(variants: Sequence[Variants], rig: Rig, settings: FlightSettings) -> list[Variants]:
-    """`variants` whose gains hold the apps' parameters as well: mount, goal of O from the start, battery, curve."""
+    """`variants` whose gains include the apps' parameters: mount, goal of O from the start [m], battery [V], curve."""
     found: list[Variants] = []
     for own, mount in zip(variants, rig.mounts, strict=True):
         places = {"goal": settings.goal, "mount": mount}
-        told = {
+        shared = {
             f"{GROUP}.{what}{axis}": float(place[i]) for what, place in places.items() for i, axis in enumerate("XYZ")
         }
-        told[f"{GROUP}.battery"] = settings.limits.battery
+        shared[f"{GROUP}.battery"] = settings.limits.battery
         curves: dict[CurveName, Variant] = {}
         for name, variant in own.items():
-            gains = {**variant.gains, **told, f"{GROUP}.curve": float(CURVE_NAMES.index(name))}
+            gains = {**variant.gains, **shared, f"{GROUP}.curve": float(CURVE_NAMES.index(name))}
             curves[name] = variant._replace(gains=gains)
         found.append(curves)
     return found
 
 
 class OnboardFlight(Flight):
-    """See the module."""
+    """A `Flight` that sends orders to the apps instead of setpoints."""
 
     def begin(self, now: float) -> None:
         """See `Flight.begin`."""
         self._noted: dict[str, tuple[object, ...]] = {}
-        self._of_apps: list[Fault] = []  # of this tick
+        self._app_faults: list[Fault] = []  # of this tick
         super().begin(now)
 
     def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
-        """No setpoints: only what the figures of the flight need."""
+        """(None, []): the laptop computes no setpoints. Updates the flight statistics."""
         if self.supervisor.state in GUIDED:
             seen = object_state(self._states, self.rig)
             self._highest_place = max(self._highest_place, self._height(seen))
@@ -147,14 +147,14 @@ class OnboardFlight(Flight):
                 self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
         return None, []
 
-    def _is_off(self) -> bool:
-        """True once an app says that its law flies."""
+    def _is_airborne(self) -> bool:
+        """True once an app reports that its controller flies."""
         return self.settings.dry_run or any(app is not None and app.phase >= Phase.FLY for app in self._apps())
 
-    def _stuck(self) -> str:
+    def _stuck_message(self) -> str:
         return f"{STUCK}: is it heavier, or does a propeller give less?"
 
-    def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+    def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
         return [ZERO, ZERO]
 
     def _send(self, link: DroneLink, watch: UplinkWatch, value: Setpoint) -> None:
@@ -165,34 +165,35 @@ class OnboardFlight(Flight):
             link.send(order(wanted))
 
     def _advance(self, faults: list[Fault]) -> None:
-        self._of_apps = self._from_apps()
-        super()._advance([one for fault in faults if (one := self._translated(fault))] + self._of_apps)
+        self._app_faults = self._from_apps()
+        super()._advance([one for fault in faults if (one := self._translated(fault))] + self._app_faults)
 
     def _note_ending(self, faults: list[Fault], gap: float) -> None:
-        """What the apps say; nothing that they see to."""
-        super()._note_ending([fault for fault in faults if fault.event not in THEIRS] + self._of_apps, gap)
+        """Record the faults of the apps, and those of the laptop that the apps do not handle."""
+        super()._note_ending([fault for fault in faults if fault.event not in HANDLED_BY_APPS] + self._app_faults, gap)
 
     def _translated(self, fault: Fault) -> Fault | None:
-        """What a fault is to a flight on board."""
+        """The fault as it applies to a flight on board; None if the apps handle it."""
         if self.supervisor.state not in AIRBORNE:
-            return self._spun(fault)
-        if fault.event in THEIRS:
+            return self._before_lift(fault)
+        if fault.event in HANDLED_BY_APPS:
             return None
-        # Whoever is still heard lands, and takes the other one along.
+        # The drone that is still connected lands, and the app of the other one follows it.
         lost = fault.event in (Event.STALE, Event.LINK_LOST, Event.FROZEN)
         return Fault(Event.APP_LANDS, fault.detail) if lost else fault
 
-    def _spun(self, fault: Fault) -> Fault | None:
-        """Motors may turn on before both apps are ready; then it is too early for more thrust."""
+    def _before_lift(self, fault: Fault) -> Fault | None:
+        """`fault`, or None for CURVE_KNOWN until both apps have reached SPIN: thrust must not rise before."""
         early = fault.event is Event.CURVE_KNOWN and not self.settings.dry_run
         return None if early and any(app is None or app.phase is not Phase.SPIN for app in self._apps()) else fault
 
     def _apps(self) -> list[AppSample | None]:
-        """What the apps logged, None where nothing is known of late."""
+        """Newest log sample of each app, None if there is none younger than `STATE_AGE`."""
         samples = [link.telemetry.app for link in self.links]
         return [app if app is not None and self._now - app.arrival <= STATE_AGE else None for app in samples]
 
     def _from_apps(self) -> list[Fault]:
+        """Events that the apps report and that change the supervisor's state; none in a dry run."""
         state, found = self.supervisor.state, []
         for name, app in zip(NAMES, self._apps(), strict=True):
             if app is None:
@@ -200,16 +201,16 @@ class OnboardFlight(Flight):
             self._note_app(name, app)
             if state is State.SPIN and self.elapsed > STATE_AGE and app.phase <= Phase.SPIN and app.refusal:
                 found.append(Fault(Event.APP_REFUSES, f"{name}: {reason(app.refusal)}"))
-            elif state in AIRBORNE and app.phase in NEWS and self.elapsed > STATE_AGE / 2:
+            elif state in AIRBORNE and app.phase in PHASE_EVENTS and self.elapsed > STATE_AGE / 2:
                 ended = app.phase in (Phase.STOP, Phase.IDLE) and state in (State.LAND, State.DESCEND)
-                event = Event.TOUCHED_DOWN if ended and reason(app.cause) in LANDED else NEWS[app.phase]
+                event = Event.TOUCHED_DOWN if ended and reason(app.cause) in LANDED else PHASE_EVENTS[app.phase]
                 found.append(Fault(event, f"{name}: {reason(app.cause)}"))
         if self.settings.dry_run:
             return []
         return [fault for fault in found if (state, fault.event) in TRANSITIONS]
 
     def _note_app(self, name: str, app: AppSample) -> None:
-        """Into the log, once."""
+        """Log the app's phase when it has changed."""
         if self._noted.get(name) == app[:-1]:
             return
         self._noted[name] = app[:-1]

@@ -1,4 +1,4 @@
-"""What a policy's card says about how it is flown: configuration, gains, command maps, goal; and its two laws."""
+"""How a policy is flown, by the metadata in its file: configuration, gains, command maps, goal; both controllers."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from mjxfly.setpoints import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCur
 from mjxfly.telemetry import Rig
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
-STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
-LOW_BATTERY = {"brushless": 3.35}  # [V], where it is not that of `Limits`
-UNKNOWN_MASS = 0.07  # of all that flies, where the card's plant is not a pair of Crazyflies [kg]
+STAND_GOAL = (0.0, 0.0, 0.08)  # on the stand: level at the paper's p_l^d [m]
+LOW_BATTERY = {"brushless": 3.35}  # [V], for drones whose limit differs from that of `Limits`
+UNKNOWN_MASS = 0.07  # total mass if the policy's plant is not a pair of Crazyflies [kg]
 
 
 def load_policy(path: Path) -> PolicyFile:
-    """The policy in the file `path`, one for any rig told that it flies two Crazyflies. Raises PolicyFileError."""
+    """The policy in the file `path`; one trained for any rig is given a pair of Crazyflies. Raises PolicyFileError."""
     contents = load_file(path)
     if not team.is_for_any(contents.card):
         return contents
@@ -36,9 +36,9 @@ def load_policy(path: Path) -> PolicyFile:
 
 
 def config_of(card: Mapping[str, Any]) -> Config:
-    """The configuration that a policy was trained with; what older files did not record has its default.
+    """The configuration that a policy was trained with; settings that an older file lacks have their defaults.
 
-    Raises InputError if the card's configuration is none.
+    Raises InputError for an invalid configuration.
     """
     data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
     data["plant"] = {**data["plant"], **card["plant"]}
@@ -50,7 +50,7 @@ def config_of(card: Mapping[str, Any]) -> Config:
 
 
 def mount_angle(card: Mapping[str, Any]) -> float:
-    """Angle about body z by which the axes are turned in which the policy sees and commands [rad], see `team`."""
+    """Angle [rad] about body z from the object's axes to those in which the policy sees and commands, see `team`."""
     return float(card.get("team", {}).get("mount_angle", 0.0))
 
 
@@ -60,7 +60,7 @@ def is_crazyflie(config: Config) -> bool:
 
 
 def gains_of(config: Config) -> PairGains:
-    """Firmware parameters that make both cascades those that the policy was trained with; none for others."""
+    """Firmware parameters of the cascades that the policy was trained with; empty for other plants than Crazyflies."""
     if not is_crazyflie(config):
         return {}, {}
     return crazyflie.pair_gains(config.autopilot)
@@ -72,12 +72,12 @@ def goal_of(config: Config) -> tuple[float, float, float]:
 
 
 def times_of(config: Config) -> Times:
-    """How long the flight's states last: the paper's thrust law follows its goal down too weakly to wait for it."""
+    """Durations of the states. With the paper's thrust map a pair follows a sinking goal too weakly to wait for it."""
     return Times(land_spare=0.0) if config.autopilot.thrust_law == "paper" else Times()
 
 
 def limits_of(config: Config, goal: Sequence[float], battery: float | None = None) -> Limits:
-    """Bounds of a flight to `goal` [m]; `battery` [V]: land below it, None for what suits the drones."""
+    """Bounds of a flight to `goal` [m]; `battery` [V]: land below it, None for the default of the drones."""
     bounds = Limits()
     bounds = replace(bounds, battery=battery or LOW_BATTERY.get(drone_of(config), bounds.battery))
     return bounds if config.plant.stand == "free" else bounds.on_stand(goal[2])
@@ -85,12 +85,12 @@ def limits_of(config: Config, goal: Sequence[float], battery: float | None = Non
 
 @dataclass(frozen=True)
 class ThrustChoice:
-    """What the command line says about thrust; None: as the card has it."""
+    """Thrust settings of the command line; None: as in the policy's configuration."""
 
     law: Literal["paper", "calibrated"] | None = None
     hover: float | None = None  # [thrust units]
     curve: CurveName | None = None
-    mass: float | None = None  # of all that flies [kg]
+    mass: float | None = None  # total mass of drones and object [kg]
 
 
 def drone_of(config: Config) -> str:
@@ -104,12 +104,12 @@ def motor_of(config: Config) -> Motor:
 
 
 def curve_of(config: Config, name: CurveName) -> ForceCurve:
-    """Force of a motor from the thrust command, by a firmware with (`linear`) or without battery compensation."""
+    """Force of one motor over the thrust command, for firmware with (`linear`) or without battery compensation."""
     return ForceCurve(0.0, motor_of(config).max_force) if name == "linear" else OLDER
 
 
 def with_curve(config: Config, name: CurveName) -> Config:
-    """`config` for firmwares of the named force curve, see `motors.with_curve`; others' plants stay."""
+    """`config` for firmware with the named force curve, see `motors.with_curve`; unchanged if not for Crazyflies."""
     if not is_crazyflie(config) or name == motors.firmware(config)["curve"]:
         return config
     curve = curve_of(config, name)
@@ -117,9 +117,9 @@ def with_curve(config: Config, name: CurveName) -> Config:
 
 
 def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGains = ({}, {})) -> list[Variants]:
-    """How leader and follower are flown, by the force curve that their firmware may have.
+    """Command map and gains of leader and follower for each force curve that their firmware may have.
 
-    `choice.curve` leaves one; `more` gains are laid over the card's, whichever the curve.
+    `choice.curve` selects one curve. `more` gains override those of the policy, for every curve.
     """
     known = motors.firmware(config)
     possible = (known["curve"], *known["converts"]) if choice.curve is None else (choice.curve,)
@@ -134,7 +134,7 @@ def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGa
 
 
 def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple[CommandMap, CommandMap]:
-    """Command maps of leader and follower: each carries itself and its share of the object, as in simulation."""
+    """Command maps of leader and follower: each carries itself and its share of the object's mass, as in simulation."""
     plant, autopilot = config.plant, config.autopilot
     known = is_crazyflie(config)
     shares = Rig.of_plant(plant).weights
@@ -145,7 +145,7 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
     carried = [mass + share * plant.object_mass for mass, share in zip(own, shares, strict=True)]
     if choice.mass is not None or not known:
         whole = UNKNOWN_MASS if choice.mass is None else choice.mass
-        # Without a plant that can be trusted, all masses scale alike.
+        # The total is given or guessed: scale all masses by one factor.
         carried = [mass * whole / sum(carried) for mass in carried] if known else [share * whole for share in shares]
     per_acceleration = autopilot.thrust_per_acceleration
     leader, follower = (CommandMap(law, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried)
@@ -153,16 +153,16 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
 
 
 class Commands(NamedTuple):
-    """What both laws want at one tick."""
+    """Commands of both controllers at one control step."""
 
     leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
     follower: np.ndarray  # (3,) likewise
-    observation: np.ndarray  # (18,) what the follower saw
-    hidden: np.ndarray | None = None  # (H,) state of its GRU after that; None: it has none
+    observation: np.ndarray  # (18,) of the follower
+    hidden: np.ndarray | None = None  # (H,) state of its GRU after the step; None: no GRU
 
 
 class Controller:
-    """Leader and follower at the policy's own rate, by the loop, gains and limits in the policy's card."""
+    """Leader PID and follower policy, with the gains, limits and control period of the policy's configuration."""
 
     def __init__(self, policy: Policy):
         config = config_of(policy.card)
@@ -171,20 +171,20 @@ class Controller:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a flight: no integral, no memory."""
+        """Begin a flight: zero the integrals and the policy's hidden state."""
         self._integral = self._loop.zero_integral(np.zeros(3))
         self.policy.reset()
 
     @property
     def integral(self) -> np.ndarray:
-        """What both laws have integrated, see `sim.laws.Laws`."""
+        """Integrals of both controllers, see `sim.laws.Laws`."""
         return self._integral
 
     def step(self, state: Body, goal: np.ndarray) -> Commands:
-        """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
-        seen = self._loop.observe(state, goal)
-        led = self._loop.leader_command(state, goal, self._integral)
-        answer = np.asarray(self.policy(rotations.turned_about_z(seen, -self._angle)), float)
-        followed = self._loop.follower_command(rotations.turned_about_z(answer, self._angle), self._integral)
-        self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
-        return Commands(led, followed, seen, self.policy.hidden)
+        """Commands at `state` for the `goal` (3,) of O [m]. Call it once per control period."""
+        observation = self._loop.observe(state, goal)
+        leader = self._loop.leader_command(state, goal, self._integral)
+        action = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
+        follower = self._loop.follower_command(rotations.turned_about_z(action, self._angle), self._integral)
+        self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=follower)
+        return Commands(leader, follower, observation, self.policy.hidden)

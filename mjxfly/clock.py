@@ -1,13 +1,13 @@
-"""The clock of a flight: the computer's own, or a slower one that runner, watchdog and twin of a rehearsal share.
+"""The clock of a flight: the monotonic clock, or a slowed one that runner, watchdog and twin of a rehearsal share.
 
-Every time and every duration of the flight's logic is of this clock [s]. What only cflib waits for is in real time.
+All times and durations of the flight logic are on this clock [s]. Timeouts of cflib itself are in real time.
 """
 
 from __future__ import annotations
 
 import time
 
-SLOWEST = 100.0  # the factor at most
+SLOWEST = 100.0  # largest factor
 
 
 class _Pace:
@@ -15,32 +15,32 @@ class _Pace:
 
 
 def slow_down(factor: float) -> None:
-    """Have a second of this process's clock take `factor` seconds; before anything asks for the time."""
+    """Make a second of this process's clock last `factor` seconds. Call it before the first `now`."""
     _Pace.factor = factor
 
 
 def factor() -> float:
-    """How many times slower than real time this clock is."""
+    """Ratio of real time to time on this clock, 1 or more."""
     return _Pace.factor
 
 
 def now() -> float:
-    """Monotonic time [s], the same in all processes of this factor."""
+    """Monotonic time [s], the same in all processes with the same factor."""
     return time.monotonic() / _Pace.factor
 
 
 def real(seconds: float) -> float:
-    """What `seconds` of this clock take in real time [s], for whatever waits."""
+    """Real time [s] that `seconds` of this clock take, for calls that wait in real time."""
     return seconds * _Pace.factor
 
 
 def sleep(seconds: float) -> None:
-    """Wait `seconds` of this clock."""
+    """Sleep for `seconds` of this clock."""
     time.sleep(real(seconds))
 
 
 def too_slow(why: str) -> str:
-    """The sentence that ends a rehearsal which this computer cannot fly, because of `why`."""
-    kept = "in real time" if _Pace.factor == 1 else f"even {_Pace.factor:g} times slower than real time"
+    """Error sentence of a rehearsal that is too slow on this computer; `why` is the evidence."""
+    pace = "in real time" if _Pace.factor == 1 else f"even {_Pace.factor:g} times slower than real time"
     slower = f"use --rehearse --slow {2 * _Pace.factor:g}, or " if 2 * _Pace.factor <= SLOWEST else ""
-    return f"this computer is too slow for a rehearsal {kept}: {why}; {slower}end other programs"
+    return f"this computer is too slow for a rehearsal {pace}: {why}; {slower}end other programs"

@@ -1,12 +1,10 @@
-"""Opening a link with cflib: tables cached, a silent link tried again, progress shown.
+"""Opening a link with cflib, with cached tables of contents, retries and progress; reading and writing parameters.
 
-cflib asks for every entry of its tables once and waits for ever for a lost answer; a link that falls silent is
-therefore closed and opened anew. What was listed by then is not lost if the tables were complete: they are cached by
-their checksum.
+cflib requests every table entry once and waits for ever if the answer is lost. A silent link is therefore closed and
+opened again. Tables that were complete by then are cached by their checksum.
 
-Parameters are read and written by our own packets (CRTP port 2, protocol 4 and later), with a deadline for every
+Parameters are read and written with packets of our own (CRTP port 2, protocol 4 and later), with a deadline for every
 answer and repeats for lost ones: cflib's own calls wait until it has read all 240 values.
-
 """
 
 from __future__ import annotations
@@ -28,13 +26,13 @@ from mjxfly.process import bounded
 
 @dataclass(frozen=True)
 class Deadlines:
-    """How long the link may take [s]."""
+    """Time limits of the link [s]."""
 
-    connect: float = 120.0  # in all: 600 table entries the first time, each a round trip
+    connect: float = 120.0  # in total: 600 table entries the first time, one round trip each
     silence: float = 2.0  # without a packet while connecting
     attempts: int = 3
     parameter: float = 2.0  # without an answer
-    request: float = 2.0  # a packet of ours, before the flight
+    request: float = 2.0  # for cflib to take a packet, before the flight
     first_state: float = 3.0
     version: float = 1.0
     close: float = 2.0
@@ -42,7 +40,7 @@ class Deadlines:
 
 @dataclass(frozen=True)
 class Identity:
-    """What a drone says that it is; "?" where it does not."""
+    """Firmware and hardware that a drone reports; "?" for what it does not."""
 
     protocol: int = 0
     version: str = "?"  # of the firmware, such as 2026.08
@@ -51,7 +49,7 @@ class Identity:
 
 
 def table_cache() -> str | None:
-    """Directory for the tables of contents of firmwares, one file each; None if there can be none."""
+    """Directory of cached firmware tables of contents, one file each; None if it cannot be created."""
     above = user_cache()
     if above is None:
         return None
@@ -71,7 +69,7 @@ def connect(
     lost: Callable[[str], None],
     console: Callable[[str], None],
 ) -> Any:
-    """An open cflib `Crazyflie`; `lost` hears why it ends, `console` what it prints. Raises LinkError."""
+    """An open cflib `Crazyflie`; `lost` receives why it ends, `console` what it prints. Raises LinkError."""
     import cflib.crtp
 
     _start_drivers(cflib.crtp)
@@ -83,9 +81,9 @@ def connect(
             crazyflie.console.receivedChar.add_callback(console)
             if crazyflie.link is None:  # it ended in between
                 raise LinkError(f"{name} at {uri} cannot be reached: the link ended; {REACH}")
-            # Whatever looks like the answer to a connection would begin it anew, and so reset the drone's log.
+            # A packet that looks like an answer to connecting would start it again and reset the drone's log.
             crazyflie.log.refresh_toc = lambda *_: None
-            # Its pings share a lock with every send, and their thread holds that lock for ever when a link dies.
+            # Its pings share a lock with every send; when a link dies, their thread holds the lock for ever.
             bounded(crazyflie.link_statistics.stop, deadlines.close)
             return crazyflie
         bounded(crazyflie.close_link, deadlines.close)
@@ -100,7 +98,7 @@ def connect(
 def _attempt(
     uri: str, name: str, deadlines: Deadlines, started: float, progress: Callable[[str], None]
 ) -> tuple[Any, str, bool]:
-    """Open a link once; returned beside it: what stood in the way, and whether that was more than silence."""
+    """(Crazyflie, failure or "", whether the link was refused rather than silent) of one attempt to open a link."""
     from cflib.crazyflie import Crazyflie
 
     crazyflie, ready = Crazyflie(rw_cache=table_cache()), threading.Event()
@@ -114,7 +112,7 @@ def _attempt(
     def arrived(_: Any) -> None:
         heard[0] = clock.now()
 
-    # The values of all parameters would take 240 round trips; those that matter are read by name.
+    # Reading all parameters would take 240 round trips; the few that are needed are read by name.
     crazyflie.param.request_update_of_all_params = lambda: None
     crazyflie.connected.add_callback(lambda _: ready.set())
     crazyflie.connection_failed.add_callback(refused)
@@ -132,7 +130,7 @@ def _attempt(
 
 
 def _listed(table: Any) -> int:
-    """Entries of a table that is being read; cflib has none before it begins."""
+    """Number of entries read so far of a cflib table, which is None before reading begins."""
     return sum(map(len, list(table.toc.values()))) if table is not None else 0
 
 
@@ -140,7 +138,7 @@ _drivers = threading.Lock()
 
 
 def _start_drivers(crtp: Any) -> None:
-    """Start cflib's drivers once, and keep its own messages off the terminal."""
+    """Start cflib's drivers once, and keep its log messages off the terminal."""
     with _drivers:
         if not crtp.CLASSES:
             crtp.init_drivers()
@@ -150,16 +148,16 @@ def _start_drivers(crtp: Any) -> None:
             logger.propagate = False
 
 
-NO_DRIVER = "Couldn't load link driver: "  # of cflib: it is not the drone's fault
+NO_DRIVER = "Couldn't load link driver: "  # cflib's message if no dongle is found
 DONGLE = "plug a Crazyradio in for it; on Linux it needs Bitcraze's udev rules"
 REACH = "is it on and in reach, and is the URI its own?"
 PORT, READ, WRITE = 2, 1, 2
-WINDOW = 4  # requests on their way at once: the firmware's queue is short
-REPEAT = 0.25  # [s] after which a request is sent again
+WINDOW = 4  # requests in flight: the firmware's queue is short
+REPEAT = 0.25  # [s] after which a request is repeated
 
 
 class LinkError(InputError):
-    """A drone that cannot be reached or is not what is needed, in one sentence."""
+    """A drone cannot be reached or does not fit the flight; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -172,16 +170,16 @@ class Element:
 
 
 class Parameters:
-    """The parameters of one drone. `received` is called by the thread that receives, the rest by any other."""
+    """The parameters of one drone. The receiving thread calls `received`; any other thread may call the rest."""
 
     def __init__(self, drone: str, find: Callable[[str], Element | None], send: Callable[[Packet], None], wait: float):
-        """`find` looks an element up by name, `send` must not block, `wait` [s] is the deadline of every answer."""
+        """`find` looks up an element by name, `send` must not block, `wait` [s] is the deadline of every answer."""
         self._drone, self._find, self._send, self._wait = drone, find, send, wait
         self._answers: dict[tuple[int, int], bytes] = {}  # (channel, ident) -> payload behind the ident
         self._changed = threading.Condition()
 
     def received(self, packet: Any) -> None:
-        """A packet of port 2 came."""
+        """Store the answer in a packet of port 2."""
         data = bytes(packet.data)
         if packet.channel in (READ, WRITE) and len(data) >= 2:
             with self._changed:
@@ -193,7 +191,7 @@ class Parameters:
         return [name for name in names if self._find(name) is not None]
 
     def read(self, names: Iterable[str]) -> dict[str, float]:
-        """Values by name. Raises LinkError for an unknown one, or one that is not answered."""
+        """Values by name. Raises LinkError for a parameter that is unknown or not answered."""
         elements = {name: self._element(name) for name in names}
         answers = self._ask({name: Packet(PORT, READ, struct.pack("<H", e.ident)) for name, e in elements.items()})
         try:  # a status byte precedes the value
@@ -204,9 +202,9 @@ class Parameters:
             ) from None
 
     def write(self, values: Mapping[str, float], check: bool = True) -> None:
-        """Write `values`, and read them back unless the firmware may change them itself (`check` false).
+        """Write `values` and read them back; without `check` if the firmware changes them itself.
 
-        Raises LinkError naming the parameter that is unknown, read-only, not confirmed, or reads otherwise.
+        Raises LinkError naming a parameter that is unknown, read-only, not confirmed, or reads back differently.
         """
         packets = {name: Packet(PORT, WRITE, self._request(name, value)) for name, value in values.items()}
         self._ask(packets)
@@ -236,7 +234,7 @@ class Parameters:
             raise LinkError(text) from None
 
     def _ask(self, requests: Mapping[str, Packet]) -> dict[str, bytes]:
-        """Send all `requests`, a few at a time, and return their answers. Raises LinkError at the deadline."""
+        """Send all `requests`, `WINDOW` at a time; return the answers. Raises LinkError at the deadline."""
         waiting, found, sent = list(requests), dict[str, bytes](), dict[str, float]()
         keys = {name: (packet.channel, struct.unpack("<H", packet.data[:2])[0]) for name, packet in requests.items()}
         with self._changed:

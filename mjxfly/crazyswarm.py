@@ -1,7 +1,7 @@
-"""Two robots of a Crazyswarm2 file (crazyflies.yaml, fileversion 1 to 3): links, places, bodies, parameters.
+"""Two robots of a Crazyswarm2 file (crazyflies.yaml, fileversion 1 to 3): links, positions, bodies, parameters.
 
-Its layout is of IMRCLab/crazyswarm2 at f6154e2, crazyflie/config/crazyflies.yaml and docs2/usage.rst. Parameters of a
-robot come before those of its type, and these before those of all.
+The format follows IMRCLab/crazyswarm2 at f6154e2, crazyflie/config/crazyflies.yaml and docs2/usage.rst. Parameters of a
+robot override those of its type, which override those of `all`.
 """
 
 from __future__ import annotations
@@ -26,51 +26,51 @@ from mjxfly.uri import check_pair, parse_uri
 LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
 MERGE = "tag:yaml.org,2002:merge"  # the key <<
 VERSIONS = (1, 2, 3)  # of the file
-NEAR = 0.1  # [m] that a start may be beside the mount
+NEAR = 0.1  # [m] tolerance of the initial positions against the mounts
 
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot of the file that can fly."""
+    """One robot of the file that is enabled and has a connection."""
 
     name: str
     uri: str
     place: np.ndarray | None  # (3,) initial position [m]
-    tracked: bool  # by the cameras' own program, as a body of its name
+    tracked: bool  # by the motion capture program, as a rigid body of its name
     parameters: Gains
-    unused: frozenset[str]  # keys that nothing is made of
+    unused: frozenset[str]  # keys of the file that are ignored
 
 
 @dataclass(frozen=True)
 class CrazyswarmPair:
-    """Leader and follower."""
+    """Leader and follower, read from a Crazyswarm2 file."""
 
     path: Path
     robots: tuple[Robot, Robot]
-    chosen: str  # how
+    chosen: str  # how they were selected, in words
 
     @property
     def uris(self) -> tuple[str, str]:
-        """Of leader and follower."""
+        """URIs of leader and follower."""
         return self.robots[0].uri, self.robots[1].uri
 
     @property
     def parameters(self) -> PairGains:
-        """Firmware parameters to write to leader and follower."""
+        """Firmware parameters to be written to leader and follower."""
         return self.robots[0].parameters, self.robots[1].parameters
 
     @property
     def bodies(self) -> tuple[str, str] | None:
-        """Rigid bodies of the motion capture system; None if it does not know the drones by name."""
+        """Rigid bodies of the motion capture system; None unless it tracks both drones by name."""
         one, other = self.robots
         return (one.name, other.name) if one.tracked and other.tracked else None
 
     def describe(self, rig: Rig) -> list[str]:
-        """Who is who, and what of the file is not used, a sentence each. Raises InputError for swapped places."""
+        """Sentences on the roles and on ignored keys. Raises InputError if the initial positions are swapped."""
         leader, follower = self.robots
-        told = [f"{self.path.name}: {leader.name} leads, {follower.name} follows, {self.chosen}", *self._places(rig)]
+        found = [f"{self.path.name}: {leader.name} leads, {follower.name} follows, {self.chosen}", *self._places(rig)]
         unused = sorted(leader.unused | follower.unused)
-        return [*told, f"{self.path.name}: not used: {', '.join(unused)}"] if unused else told
+        return [*found, f"{self.path.name}: not used: {', '.join(unused)}"] if unused else found
 
     def _places(self, rig: Rig) -> list[str]:
         leader, follower = self.robots
@@ -137,7 +137,7 @@ def _parsed(path: Path) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """YAML that says everything once."""
+        """Safe YAML without duplicate keys and with a bounded number of aliases."""
 
         aliases = 0
 
@@ -152,7 +152,7 @@ def _parsed(path: Path) -> Any:
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             self.aliases += self.check_event(yaml.AliasEvent)
-            if self.aliases > MOST_ALIASES:  # nested ones grow without bounds
+            if self.aliases > MOST_ALIASES:  # nested aliases expand exponentially
                 raise ValueError(f"it has more than {MOST_ALIASES} aliases, *name")
             return super().compose_node(parent, index)
 
@@ -228,7 +228,7 @@ def _place(value: Any, where: str) -> np.ndarray | None:
 
 
 def _number(value: Any, where: str) -> float:
-    """YAML 1.1 takes 1e-3, which has no point, for a text; Crazyswarm2's own file has it."""
+    """A finite float. Strings count too: YAML 1.1 reads 1e-3 as a string, and Crazyswarm2's own file has it."""
     try:
         number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else math.nan
     except (ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""What the person at the laptop sees and presses: terminal display, live view in a browser, keys and signals."""
+"""User interface of a flight: terminal display, live view in a browser, keys and signals."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ KEYS = "keys: l lands, space stops the motors at once"
 
 
 class View(NamedTuple):
-    """What a display may show; replaced as a whole at every tick."""
+    """Snapshot of a flight for the display, replaced at every tick."""
 
     time: float  # [s] since the start
     supervisor: Supervisor
     states: list[DroneState]
-    ages: list[float]
+    ages: list[float]  # of the states [s]
     wanted: tuple[Setpoint, Setpoint]
-    late: float  # [s]
-    missed: int
-    carry: str = ""  # what is to be done by hand
+    late: float  # [s] of the tick
+    missed: int  # deadlines in the last second
+    carry: str = ""  # instructions to the person who carries the pair in a dry run
 
 
 def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -> list[str]:
-    """What is shown of `view`, in lines that fit a terminal of `columns`; danger is white on red."""
+    """`view` as lines that fit a terminal of `columns`; danger is white on red."""
     state = view.supervisor.state
     code = GREEN if state in GUIDED and view.supervisor.cause is None else YELLOW
     code = RED if view.supervisor.cause is not None or state in (State.HOLD, State.KILL) else code
@@ -74,13 +74,13 @@ def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -
 
 
 def plain(view: View) -> str:
-    """The phase and why it was entered, for a terminal that cannot go back a line, or none at all."""
+    """One line with the phase and its cause, for output that cannot be redrawn."""
     cause = view.supervisor.cause
     return f"{view.time:7.2f} s  {view.supervisor.state.value}" + (f": {cause}" if cause else "")
 
 
 def _wrapped(parts: list[tuple[str, str]], columns: int, colour: bool) -> list[str]:
-    """Texts and their colours in lines of less than `columns`: one that a terminal breaks is not overwritten."""
+    """(text, colour) pairs laid out in lines shorter than `columns`: a line that the terminal wraps is not erased."""
     rows: list[list[str]] = [[]]
     width = 0
     pieces = [(text, code) for whole, code in parts for text in _pieces(whole, columns - 1)]
@@ -97,9 +97,9 @@ def _pieces(text: str, width: int) -> list[str]:
 
 
 class Display:
-    """Redraws what `view` returns until it is left. A context manager.
+    """Redraws what `view` returns every `PERIOD`, in a thread. A context manager.
 
-    Without a terminal, or in one that cannot go back a line, it prints a line a phase.
+    Without a terminal that can move the cursor up it prints one line per phase.
     """
 
     def __init__(self, view: Callable[[], View | None], bounds: Limits, stream: TextIO = sys.stdout):
@@ -108,7 +108,7 @@ class Display:
         self._colour = "NO_COLOR" not in os.environ
         self._draw = self._redraw if is_live(stream) else self._print
         self._thread = threading.Thread(target=self._draw_all, name="display", daemon=True)
-        self._drawn = 0
+        self._rows_shown = 0
         self._phase: object = None
 
     def __enter__(self) -> Display:
@@ -120,7 +120,7 @@ class Display:
         self._thread.join(timeout=1)
 
     def _columns(self) -> int:
-        """Of the terminal, whose window may have changed."""
+        """Present width of the terminal, at least 20."""
         return max(columns_of(self._stream), 20)
 
     def _draw_all(self) -> None:
@@ -135,10 +135,10 @@ class Display:
 
     def _redraw(self, view: View) -> None:
         text = lines(view, self._bounds, self._colour, self._columns())
-        up = f"\x1b[{self._drawn}A\x1b[J" if self._drawn else ""
+        up = f"\x1b[{self._rows_shown}A\x1b[J" if self._rows_shown else ""
         self._stream.write(up + "".join(f"{line}\n" for line in text))
         self._stream.flush()
-        self._drawn, self._phase = len(text), view.supervisor.state
+        self._rows_shown, self._phase = len(text), view.supervisor.state
 
     def _print(self, view: View) -> None:
         phase = view.supervisor.state, view.supervisor.cause
@@ -148,11 +148,10 @@ class Display:
 
 
 def live_view(log: Path, port: int = 0, foxglove: int | None = None) -> Child:
-    """A running `python -m mjxfly.view --live` of the flight log `log`, whose `line` says where its page is.
+    """A process `python -m mjxfly.view --live` that shows the flight log `log`; its `line` has the page's address.
 
-    `foxglove` is the port of that for Foxglove, if there is to be one.
-
-    Nothing waits for it while flying: it reads the log, and its output is not read. Raises InputError.
+    `foxglove` is the port for Foxglove, None for none. The process only reads the log, so that a flight never waits for
+    it. Raises InputError.
     """
     more = [] if foxglove is None else ["--foxglove", str(foxglove)]
     flags = ["--live", "--attached", "--port", str(port), *more, "--", str(log)]
@@ -160,7 +159,7 @@ def live_view(log: Path, port: int = 0, foxglove: int | None = None) -> Child:
     return Child(["mjxfly.view", *flags], f"the live view did not start; is the port of --view{also} free?")
 
 
-KILL_KEYS = b" kK"  # the largest key, found without looking
+KILL_KEYS = b" kK"  # the space bar is found without looking
 LAND_KEYS = b"lLq\n"
 
 
@@ -168,15 +167,15 @@ LAND_KEYS = b"lLq\n"
 def listening(land: Callable[[], None], interrupt: Callable[[], None], kill: Callable[[], None]) -> Iterator[None]:
     """Call `interrupt` on Ctrl-C, `land` on SIGTERM, a closed terminal and the landing keys, `kill` on the kill keys.
 
-    What Ctrl-C pressed twice means is the caller's. Keys work in a terminal only.
+    The caller handles repeated Ctrl-C. Keys work in a terminal only.
     """
     done = threading.Event()
 
     def caught(number: int, frame: FrameType | None) -> None:
         (interrupt if number == signal.SIGINT else land)()
 
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, caught) for number in numbers}
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, caught) for number in signals}
     with _raw_terminal() as terminal:
         if terminal is not None:
             threading.Thread(target=_read, args=(terminal, done, land, kill), daemon=True).start()
@@ -190,7 +189,7 @@ def listening(land: Callable[[], None], interrupt: Callable[[], None], kill: Cal
 
 @contextlib.contextmanager
 def _raw_terminal() -> Iterator[int | None]:
-    """Standard input with single keys readable, None if it is no terminal."""
+    """File descriptor of standard input with single keys readable, None if it is no terminal."""
     try:
         import termios
         import tty

@@ -1,7 +1,7 @@
-"""Why a flight ended and how it came down: the signals of the last second in their order, and the touchdown. Pure.
+"""Why a flight ended and how the pair came down: faults of the last second in order, and the touchdown. Pure.
 
-The supervisor acts on the worst of what it sees in one tick. What began first is often another signal, such as a
-computer that stood still and for that reason neither sent nor heard anything.
+The supervisor acts on the most severe fault of one tick. Another one often began earlier, such as a computer that
+stalled and therefore neither sent nor received anything.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from mjxfly.limits import NAMES, FlightSettings
 from mjxfly.packets import GRAVITY
 from mjxfly.supervisor import ENDED, PLANNED, Event, Fault, Supervisor
 
-LAST = 1.0  # [s] before the abort from which on a signal may be its cause
-APART = 0.2  # [s] between two signals that have nothing to do with each other
-LATE = 0.03  # [s] of a tick, from where on it is a signal
-SHOWN = 3  # signals at most
-CONTACT = 0.02  # [m] of O above where it stood
-SPEED_TIME = 0.15  # [s] before the contact in which the fastest descent counts
-SPARE = 0.5  # [m/s] that a descent may be faster than a free fall from the highest place
+LAST = 1.0  # [s] before the abort in which a signal may be its cause
+APART = 0.2  # [s] of silence after which the same fault counts as a new signal, and two signals as unrelated
+LATE = 0.03  # [s] lateness of a tick that counts as a signal
+SHOWN = 3  # signals in the report at most
+CONTACT = 0.02  # [m] height of O above where it stood that counts as contact
+SPEED_TIME = 0.15  # [s] before the contact; the fastest descent in it is the touchdown speed
+SPARE = 0.5  # [m/s] by which a descent may exceed a free fall from the highest point
 
 
 @dataclass
 class Signal:
-    """Something that was wrong for a while."""
+    """A fault that lasted for some time."""
 
     event: Event
-    text: str  # as it began
+    text: str  # at its beginning
     began: float  # [s]
     last: float  # [s]
 
 
 class Signals:
-    """What is wrong, since when. `update` once a tick while the pair may fly."""
+    """Faults and when they began. `update` once a tick while the pair may fly."""
 
     def __init__(self, settings: FlightSettings):
         bounds = settings.limits
-        # What is reported once it has lasted for so long [s].
-        self._lead = {
+        # Time [s] for which these faults have lasted when they are first reported.
+        self._delay = {
             Event.STALE: bounds.state_age,
             Event.LINK_LOST: bounds.state_age,
             Event.UNHEARD: bounds.state_age,
@@ -50,36 +50,36 @@ class Signals:
             Event.SATURATED: bounds.saturation_time,
         }
         self._period = settings.period
-        self._open: dict[tuple[Event, str], Signal] = {}
-        self._all: list[Signal] = []
+        self._active: dict[tuple[Event, str], Signal] = {}
+        self._history: list[Signal] = []
 
     def update(self, faults: Sequence[Fault], now: float, gap: float = 0.0) -> None:
-        """What one tick at `now` [s] found, `gap` [s] after the one before."""
+        """Add the `faults` of one tick at `now` [s], `gap` [s] after the previous one."""
         late = max(gap - self._period, 0.0)
         for fault in faults:
             if fault.event not in (*PLANNED, Event.INTERRUPT, Event.TIMEOUT, Event.DEADLINES):
-                self._note(fault.event, str(fault), now - self._lead.get(fault.event, 0.0), now)
+                self._note(fault.event, str(fault), now - self._delay.get(fault.event, 0.0), now)
         missed = next((f" ({fault.detail})" for fault in faults if fault.event is Event.DEADLINES), "")
         if late > LATE or missed:
-            # It explains what was neither sent nor heard meanwhile, so it comes before that.
+            # The stall explains missing messages, so it must precede the faults that these cause.
             text = f"this computer was too busy: a tick came {1e3 * late:.0f} ms late{missed}"
-            self._note(Event.DEADLINES, text, now - gap - self._lead[Event.STALE], now)
+            self._note(Event.DEADLINES, text, now - gap - self._delay[Event.STALE], now)
 
     def _note(self, event: Event, text: str, began: float, now: float) -> None:
         key = event, next((name for name in NAMES if name in text), "")
-        signal = self._open.get(key)
+        signal = self._active.get(key)
         if signal is None or now - signal.last > APART:
-            signal = self._open[key] = Signal(event, text, began, now)
-            self._all.append(signal)
+            signal = self._active[key] = Signal(event, text, began, now)
+            self._history.append(signal)
         signal.last = now
 
     def chain(self, cause: Fault, at: float) -> list[Signal]:
-        """The signals of an abort with `cause` at `at` [s], the first one first.
+        """The signals that led to an abort with `cause` at time `at` [s], in order of their beginning.
 
-        Back from the abort, whatever did not end before the next one began; then what followed. Nothing older than a
-        second counts.
+        Going back from the abort, a signal belongs to the chain if it lasted until `APART` before the chain so far
+        began. Signals that ended more than `LAST` before the abort do not count.
         """
-        known = sorted((one for one in self._all if one.last >= at - LAST), key=lambda one: one.began)
+        known = sorted((one for one in self._history if one.last >= at - LAST), key=lambda one: one.began)
         first = at
         for one in sorted(known, key=lambda one: -one.last):
             if one.last >= first - APART:
@@ -88,21 +88,21 @@ class Signals:
 
 
 class Touchdown:
-    """The first contact with the ground after the pair was up, as the estimators have it."""
+    """First contact with the ground after take-off, by the drones' estimates."""
 
     def __init__(self, lifted: float):
-        """`lifted` [m] of O above where it stood is up."""
+        """`lifted` [m] is the height of O above its start from which the pair counts as airborne."""
         self._lifted, self.up = lifted, False
         self._fall: collections.deque[tuple[float, float]] = collections.deque()
         self._highest = 0.0  # [m]
-        self.doubt = ""  # why what the estimators have is no fact
+        self.doubt = ""  # why the estimates cannot be trusted
         self.speed = math.nan  # downward [m/s]
         self.place = np.full(2, math.nan)  # (2,) of O from where it stood [m]
 
     def update(self, place: np.ndarray, climb: float, now: float, doubt: str = "") -> None:
-        """O is at `place` (3,) from where it stood [m] and climbs at `climb` [m/s].
+        """Add O's position `place` (3,) relative to its start [m] and its vertical speed `climb` [m/s].
 
-        One `doubt` of that in the air, or a descent faster than any fall, and nothing is told any more.
+        After a `doubt` in the air, or a descent faster than a fall, speed and place stay unknown.
         """
         if math.isfinite(self.speed) or self.doubt or not (np.isfinite(place).all() and math.isfinite(climb)):
             return
@@ -120,7 +120,7 @@ class Touchdown:
             self.speed, self.place = max(fall for _, fall in self._fall), place[:2].copy()
 
     def __str__(self) -> str:
-        """Speed and place."""
+        """Speed and place of the touchdown in words."""
         if not math.isfinite(self.speed):
             return f"how fast and where is not known: {self.doubt}" if self.doubt else "no touchdown was seen"
         x, y = self.place
@@ -128,30 +128,30 @@ class Touchdown:
 
 
 class Ending:
-    """Both, for one flight."""
+    """Collects the signals and the touchdown of one flight, and reports its end."""
 
     def __init__(self, settings: FlightSettings, lifted: float):
         self._signals, self.touchdown = Signals(settings), Touchdown(lifted)
         self._aborted, self._now = math.inf, 0.0
 
     def update(self, faults: Sequence[Fault], supervisor: Supervisor, now: float, gap: float) -> None:
-        """One tick: its `faults`, and the `supervisor` after it."""
+        """Add one tick at `now` [s]: its `faults`, the `supervisor` after it, `gap` [s] since the previous tick."""
         self._now = now
         if supervisor.cause is None:
-            self._aborted = math.inf  # also where a gap has closed again
+            self._aborted = math.inf  # also after a HOLD that was resumed
         elif math.isinf(self._aborted):
             self._aborted = now
         if supervisor.state not in ENDED or now == self._aborted:
             self._signals.update(faults, now, gap)
 
     def sentences(self, supervisor: Supervisor, start: float, asked: bool) -> list[str]:
-        """How it ended, a line each; `start` [s] of the flight, `asked` to land."""
+        """The end of the flight in sentences; it began at `start` [s], `asked`: the user requested the landing."""
         landed = f"landed {'as asked' if asked else 'as planned'}: {self.touchdown}"
         if supervisor.cause is None:
             return [landed] if self.touchdown.up else []
         chain = self._signals.chain(supervisor.cause, min(self._aborted, self._now))[:SHOWN]
         parts = [f"{one.text} (at {max(one.began - start, 0.0):.2f} s)" for one in chain]
-        told = [f"ended early: {'; then '.join(parts)}"]
+        sentences = [f"ended early: {'; then '.join(parts)}"]
         if supervisor.cause.event not in [one.event for one in chain]:
-            told.append(f"that led to: {supervisor.cause}")
-        return [*told, f"came down: {self.touchdown}"] if self.touchdown.up else told
+            sentences.append(f"that led to: {supervisor.cause}")
+        return [*sentences, f"came down: {self.touchdown}"] if self.touchdown.up else sentences

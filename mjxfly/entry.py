@@ -1,4 +1,4 @@
-"""Entry point of installed commands but `mjxfly`, which flies: that is `mjxfly.__main__`."""
+"""Entry point of the installed commands `mjxfly-*`; that of `mjxfly` itself is `mjxfly.__main__`."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ MAINS |= {name: f"rig.{name}" for name in ("design", "gains", "identify")}
 
 
 def run() -> int:
-    """Run the command that this process is called, such as `mjxfly-view`; return its exit code."""
+    """Run the command named by this process's file name, such as `mjxfly-view`; return its exit code."""
     return run_module(f"mjxfly.{MAINS[Path(sys.argv[0]).stem.partition('-')[2]]}")

@@ -1,12 +1,12 @@
-"""Figures of a flight under both laws, once it has settled. Pure."""
+"""Statistics of a flight while both controllers are in command, after settling. Pure."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-SETTLING = 5.0  # [s] under both laws that are left out, while the pair climbs to its goal
-LEAST = 2.0  # [s] of which figures are worth a number
+SETTLING = 5.0  # [s] after the controllers take over that do not count: the pair climbs to its goal
+LEAST = 2.0  # [s] of data below which no figures are given
 UNKNOWN = (math.nan, math.nan)
 
 
@@ -15,15 +15,15 @@ class Figures:
     """Error of O, tilt of the follower and thrust of both drones over some ticks."""
 
     ticks: int = 0
-    seconds: float = 0.0  # of them
+    seconds: float = 0.0  # duration of these ticks
     error_rms: float = 0.0  # [m]
     error_peak: float = 0.0  # [m]
     tilt_rms: float = 0.0  # [rad]
     tilt_peak: float = 0.0  # [rad]
-    thrust: tuple[float, float] = (math.nan, math.nan)  # mean of leader and follower, of what should hover
+    thrust: tuple[float, float] = (math.nan, math.nan)  # means of leader and follower over nominal hover thrust
 
     def add(self, error: float, tilt: float, seconds: float, thrust: tuple[float, float]) -> None:
-        """One tick of `seconds` with O `error` [m] from its goal, a `tilt` [rad] and `thrust` as shares of hover's."""
+        """Add a tick of `seconds`: O is `error` [m] from its goal, `tilt` [rad], `thrust` over nominal hover thrust."""
         if not (math.isfinite(error) and math.isfinite(tilt)):
             return
         self.ticks += 1
@@ -36,18 +36,18 @@ class Figures:
         self.error_peak, self.tilt_peak = max(self.error_peak, error), max(self.tilt_peak, tilt)
 
     def __str__(self) -> str:
-        """In millimetres, degrees and percent."""
+        """Errors [mm], tilts [degrees] and thrusts [% from nominal] in words."""
         text = f"error rms {1e3 * self.error_rms:.1f} mm, largest {1e3 * self.error_peak:.0f} mm"
         tilt = f"tilt rms {math.degrees(self.tilt_rms):.2f}, largest {math.degrees(self.tilt_peak):.1f} degrees"
         if not all(map(math.isfinite, self.thrust)):
             return f"{text}; {tilt}"
-        # A motor that gives more needs less; a load that is heavier on one side shows in the same way.
+        # A stronger motor needs less thrust; an uneven load has the same effect.
         leader, follower = (f"{100 * (share - 1):+.0f}" for share in self.thrust)
-        return f"{text}; {tilt}; thrust {leader} / {follower} % of the card's"
+        return f"{text}; {tilt}; thrust {leader} / {follower} % from nominal"
 
 
 class Flown:
-    """Keeps the figures of one flight."""
+    """Accumulates the figures of one flight."""
 
     def __init__(self) -> None:
         self._figures = Figures()
@@ -55,15 +55,15 @@ class Flown:
 
     @property
     def figures(self) -> Figures | None:
-        """Of at least `LEAST` seconds, else None."""
+        """The figures of at least `LEAST` seconds, else None."""
         return self._figures if self._figures.seconds >= LEAST else None
 
     def update(
         self, now: float, elapsed: float, distance: float, tilt: float, thrust: tuple[float, float] = UNKNOWN
     ) -> None:
-        """A tick at `now` [s], `elapsed` [s] under both laws, O `distance` [m] from its goal, at a `tilt` [rad].
+        """Add a tick at `now` [s], `elapsed` [s] after the controllers took over, O `distance` [m] from its goal.
 
-        `thrust` of leader and follower are shares of what the card says hovers.
+        `tilt` [rad] is the follower's; `thrust` are leader's and follower's over nominal hover thrust.
         """
         seconds, self._last = now - self._last, now
         if elapsed >= SETTLING:

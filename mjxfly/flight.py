@@ -1,4 +1,4 @@
-"""One flight, tick by tick: states in, faults to the supervisor, setpoints out to both drones. No clock, no thread."""
+"""Control loop of one flight: states in, faults to the supervisor, setpoints to both drones. No clock, no thread."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from mjxfly.takeoff import TakeOff
 from mjxfly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxfly.watchdog import Watchdog
 
-HIDDEN_DECIMALS = 4  # of a GRU's state in the log, 50 times a second
-LIFTED = 0.05  # [m], or half of the goal's height if that is less, from which on a pair counts as having flown
+HIDDEN_DECIMALS = 4  # of a GRU's state in the log, which holds it 50 times a second
+LIFTED = 0.05  # [m] height of O, or half of the goal's if that is less, from which the pair counts as airborne
 
 
 class Flight:
-    """See the module. `tick` is called once per period until it returns false."""
+    """State and control loop of a flight. Call `begin`, then `tick` once per period until it returns false."""
 
     def __init__(
         self,
@@ -51,15 +51,15 @@ class Flight:
         self.flown = Flown()
         self.supervisor = Supervisor()
         self.interrupts, self.kill = 0, False
-        self.ready: bool | None = None  # checks before flight: not known yet, passed, failed
+        self.ready: bool | None = None  # preflight checks: None not known yet, else whether they passed
         self.refusal = ""
-        self.excuse: Callable[[Fault], Exception | None] = lambda cause: None  # for a fault that is this computer's
+        self.excuse: Callable[[Fault], Exception | None] = lambda cause: None  # error if a slow computer is to blame
         self.view: View | None = None
         self.spin = SpinCheck(links, variants, assumed, settings.motor)
-        self.highest = [0, 0]  # thrust of each drone that was wanted [units]
+        self.highest = [0, 0]  # largest thrust of each drone so far, sent or withheld in a dry run [units]
         self._sent: list[Setpoint] = [ZERO, ZERO]
-        self._needed = (1.0, 1.0)  # force of leader and follower by which they hover level, of what the card says
-        self._trims = [0.0, 0.0]  # thrust that hovers [units]: a running average of what was sent
+        self._hover_scale = (1.0, 1.0)  # hover force of leader and follower over nominal, found at take-off
+        self._trims = [0.0, 0.0]  # hover thrust [units]: a running average of the sent thrust
         self._commands: Commands | None = None
         self._every = max(round(controller.period / settings.period), 1)  # ticks per command
         self._count = 0
@@ -67,25 +67,25 @@ class Flight:
         self._lift = LiftWatch(settings.motor)
         self.ending = Ending(settings, self._lifts_at)
         self._saturated = Sustained(settings.limits.saturation_time)
-        self._back = Sustained(settings.limits.fresh)
+        self._recovered = Sustained(settings.limits.fresh)
         self._holds = 0
         self._hold_for = settings.times.drone_watchdog
         self._descend_for = settings.times.descent_limit(settings.goal[2])
-        self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
+        self._plan = [1.0]  # planned thrust over trim for each tick without a measured height
         self._land_height = 0.0
         self._heights = collections.deque([math.inf], round(settings.times.rest / settings.period) + 1)  # of O [m]
-        self._highest_place = 0.0  # of O above where it stood, under the laws [m]
+        self._highest_place = 0.0  # largest height of O above its start while the controllers are in command [m]
         self._take_off = TakeOff(rig, settings.times, settings.period, self._lifts_at, settings.stand)
 
     @property
     def maps(self) -> tuple[CommandMap, CommandMap]:
-        """Command maps of leader and follower for their firmwares' force curves, and for what the take-off found."""
-        leader, follower = (own.map.scaled(s) for own, s in zip(self.spin.chosen(), self._needed, strict=True))
+        """Command maps of leader and follower: their firmwares' force curves, scaled by `TakeOff.needed`."""
+        leader, follower = (own.map.scaled(s) for own, s in zip(self.spin.chosen(), self._hover_scale, strict=True))
         return leader, follower
 
     @property
     def lifted(self) -> bool:
-        """True if the pair left the ground, or was not to."""
+        """True if the pair has left the ground under its controllers, or if the goal is on the ground."""
         return self._highest_place >= self._lifts_at
 
     @property
@@ -100,23 +100,23 @@ class Flight:
 
     @property
     def elapsed(self) -> float:
-        """Time in the supervisor's present state [s]."""
+        """Time since the supervisor entered its state [s]."""
         return self._now - self.supervisor.since
 
     def begin(self, now: float) -> None:
-        """Where the pair stands now is where it starts; both links must have a state."""
+        """Start the flight at `now` [s] from the pair's present position; both links must have a state."""
         self._read(now)
         self._start, self._monitor.origin = now, object_state(self._states, self.rig).position
         self.supervisor = Supervisor(State.CHECK, now)
 
     def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
-        """Everything that happens in one period; false once the flight is done.
+        """Do one period: read states, find faults, advance the supervisor, send, log. False once the flight is done.
 
-        `late` [s] is this tick's, `missed` the deadlines missed within the last second, `gap` [s] the time since the
-        tick before.
+        `late` [s] is the lateness of this tick, `missed` the number of deadlines missed in the last second, `gap` [s]
+        the time since the previous tick.
         """
         self._read(now)
-        faults = self._from_outside(missed, gap)
+        faults = self._external_faults(missed, gap)
         faults += self._monitor.update(self.supervisor.state, self.links, self._ages, now)
         if self._mocap is not None and any(fault.event is Event.FRAME for fault in faults):
             self._mocap.halt()
@@ -124,7 +124,7 @@ class Flight:
         mapped, broken = self._command()
         self._advance(faults + broken + self._progress())
         self._note_ending(faults + broken, gap)
-        wanted = self._wanted(mapped)
+        wanted = self._setpoints(mapped)
         self._transmit(wanted)
         self._record(wanted, late, missed)
         self._count += 1
@@ -135,10 +135,10 @@ class Flight:
         if any(self._fresh) and self.supervisor.state not in ON_GROUND:
             seen = self._object()
             place, climb = seen.position - self._monitor.origin, float(seen.velocity[2])
-            self.ending.touchdown.update(place, climb, self._now, self._doubt())
+            self.ending.touchdown.update(place, climb, self._now, self._distrust())
 
-    def _doubt(self) -> str:
-        """Why what is known of the pair is no fact, empty if it is."""
+    def _distrust(self) -> str:
+        """Why the pair's estimated state cannot be trusted, empty if it can."""
         fresh = [state for state, known in zip(self._states, self._fresh, strict=True) if known]
         if not all(tilt_angle(state.quaternion) <= self.settings.limits.tilt for state in fresh):
             return "it turned over"
@@ -147,7 +147,7 @@ class Flight:
         return "" if believed else "no estimator is believed"
 
     def how_it_ended(self) -> list[str]:
-        """Why, and how the pair came down, a sentence each."""
+        """Sentences on why the flight ended and how the pair came down."""
         return self.ending.sentences(self.supervisor, self._start, asked=self.interrupts > 0)
 
     def _read(self, now: float) -> None:
@@ -156,16 +156,16 @@ class Flight:
         self._ages = [link.telemetry.age(now) for link in self.links]
         self._fresh = [age <= self.settings.limits.state_age for age in self._ages]
 
-    # What is wrong.
+    # Faults and events.
 
-    def _from_outside(self, missed: int, gap: float) -> list[Fault]:
-        """What user, links, loop, cameras and watchdog say."""
+    def _external_faults(self, missed: int, gap: float) -> list[Fault]:
+        """Faults and requests of user, links, control loop, motion capture, batteries and watchdog."""
         bounds, faults = self.settings.limits, []
         if self.kill or self.interrupts > 1:
             faults.append(Fault(Event.KEY_KILL, "asked for on the laptop"))
         elif self.interrupts:
             faults.append(Fault(Event.INTERRUPT, "asked for on the laptop"))
-        # Time in which this computer did nothing says nothing of the links.
+        # While this computer stalled it could not hear the links: do not count that time against them.
         idle = max(gap - self.settings.period, 0.0)
         faults += link_faults(self.links, [age - idle for age in self._ages], bounds, self._now - idle)
         if self._holds > bounds.gaps:
@@ -177,19 +177,19 @@ class Flight:
         if self.flying and all(self._fresh):
             volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
             faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
-        # Also on the ground once motors turn: the tick that begins the ramp may stand still before the next beat.
+        # Also on the ground once motors turn: the loop may hang in the tick that begins the ramp.
         guarded = self.flying or (self.supervisor.state is State.SPIN and not self.settings.dry_run)
         if self.watchdog is not None and not self.watchdog.beat(guarded, self._last_known_state()):
             faults.append(Fault(Event.WATCHDOG))
         return faults
 
-    # What is known of the pair.
+    # Estimates.
 
     def _object(self) -> ObjectState:
         return self._monitor.object or object_state(self._states, self.rig)
 
     def _height(self, seen: ObjectState) -> float:
-        """Of O above where it stood [m]."""
+        """Height of O above where it stood [m]."""
         return float(seen.position[2] - self._monitor.origin[2])
 
     def _last_known_state(self) -> LastKnownState:
@@ -201,46 +201,47 @@ class Flight:
     def _trusted(self) -> ObjectState | None:
         return self._monitor.object if any(self._monitor.estimators.trusted) else None
 
-    def _stands(self) -> bool:
+    def _landed(self) -> bool:
+        """True if the pair is near the ground and has stopped sinking; without an estimate by the time of the plan."""
         seen, times = self._trusted(), self.settings.times
-        if seen is None:  # nothing tells: by the time that the blind way down takes, with some to spare
-            return self.elapsed >= len(self._shares) * self.settings.period + times.settled
+        if seen is None:  # no trusted estimate: assume it once the planned blind descent and a margin have passed
+            return self.elapsed >= len(self._plan) * self.settings.period + times.settled
         low = self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
         return low and self._heights[0] - self._heights[-1] < times.rest_sunk
 
-    def _is_off(self) -> bool:
-        """True once the legs carry nothing, so that the laws may take over."""
+    def _is_airborne(self) -> bool:
+        """True once the pair is off the ground, so that the controllers may take over."""
         seen = self._trusted()
         return self.settings.dry_run or (seen is not None and self._height(seen) >= self._lifts_at)
 
-    # What the laws want.
+    # Control.
 
     def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
-        """Setpoints of both laws while they are in command, and what is wrong with them."""
+        """Setpoints of both controllers, None while they are not in command; faults of these setpoints."""
         if self.supervisor.state not in GUIDED:
             return None, []
         try:
             seen = object_state(self._states, self.rig)
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
-                card = [own.map.hover_thrust for own in self.spin.chosen()]
-                one, other = (sent.thrust / hover for sent, hover in zip(self._sent, card, strict=True))
+                nominal = [own.map.hover_thrust for own in self.spin.chosen()]
+                one, other = (sent.thrust / hover for sent, hover in zip(self._sent, nominal, strict=True))
                 self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
-            laws = [law + self._probe() for law in (self._commands.leader, self._commands.follower)]
-            mapped = [setpoints.to_setpoint(law, constants) for law, constants in zip(laws, self.maps, strict=True)]
+            commands = [own + self._probe() for own in (self._commands.leader, self._commands.follower)]
+            mapped = [setpoints.to_setpoint(own, constants) for own, constants in zip(commands, self.maps, strict=True)]
         except (PacketError, ValueError, FloatingPointError) as error:
             return None, [Fault(Event.BAD_STATE, str(error))]
         self._highest_place = max(self._highest_place, self._height(seen))
-        # A dry run never lifts: the laws ask for more and more.
+        # A dry run never lifts, so the commanded thrust keeps rising.
         saturated = any(one.saturated for one in mapped) and not self.settings.dry_run
         if self._saturated.update(saturated, self._now):
             return mapped, [Fault(Event.SATURATED, f"for {self.settings.limits.saturation_time:g} s")]
         return mapped, []
 
     def goal(self, now: float) -> np.ndarray:
-        """Goal of O (3,) at `now` [m]; while landing it sinks, far below the ground, since the laws lag behind it."""
+        """Goal of O (3,) at `now` [m]. While landing it sinks, to below the ground, since the pair lags behind it."""
         goal = self._monitor.origin + np.array(self.settings.goal)
         if self._probes:
             goal[2] = self._monitor.origin[2] + min(self.settings.goal[2], probe.HEIGHT)
@@ -251,34 +252,34 @@ class Flight:
 
     @property
     def carry(self) -> str:
-        """In a dry run on motion capture: what is to be done by hand, so that the drones' IMUs can judge the axes."""
+        """In a dry run on motion capture: how to move the pair by hand, so that the IMUs can verify the axes."""
         return self._monitor.not_shown() if self._mocap is not None and self.settings.dry_run else ""
 
     @property
     def _probes(self) -> bool:
-        """True at the begin of a flight on motion capture, whose axes no flight has shown to be right."""
+        """True at the beginning of FLY on motion capture: the measured axes are not verified yet."""
         return self._mocap is not None and self.supervisor.state is State.FLY and self.elapsed < probe.TIME
 
     def _probe(self) -> np.ndarray:
         return probe.command(self.elapsed, self.rig.span) if self._probes else np.zeros(3)
 
-    # What comes next.
+    # State changes.
 
     def _progress(self) -> list[Fault]:
-        """Events of time and place."""
+        """Planned events and timeouts of the supervisor's state."""
         state, elapsed, times, dry = self.supervisor.state, self.elapsed, self.settings.times, self.settings.dry_run
         can_fly, infos = packets.ARMED | packets.CAN_FLY, [one.info for one in self._states]
         armed = dry or all(info & can_fly == can_fly for info in infos)
         flying = any(info & packets.FLYING for info in infos) or not all(self._fresh)
         hindered = self._holds > self.settings.limits.gaps + 1 or any(link.lost for link in self.links)
         heard = all(self._fresh) and all(watch.hears for watch in self._monitor.uplinks)
-        resumes = heard and self.supervisor.may_resume and not (hindered or self._stands())
+        resumes = heard and self.supervisor.may_resume and not (hindered or self._landed())
         reached = {
             Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
-            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_off(),
+            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_airborne(),
             Event.TIME_UP: state is State.FLY and elapsed >= self.settings.seconds,
-            Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._stands(),
-            Event.RESUMED: state is State.HOLD and self._back.update(resumes, self._now),
+            Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._landed(),
+            Event.RESUMED: state is State.HOLD and self._recovered.update(resumes, self._now),
             Event.GROUNDED: state is State.STOP and elapsed >= times.stop and not flying,
         }
         events = [Fault(event) for event, is_reached in reached.items() if is_reached]
@@ -288,12 +289,12 @@ class Flight:
             known = [Fault(Event.CURVE_KNOWN, "dry run")] if dry else None
             events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
         if elapsed >= self._limit(state):
-            stuck = state is State.RAMP and not self._is_off()
-            text = self._stuck() if stuck else f"{state.value} lasted {elapsed:.1f} s"
+            stuck = state is State.RAMP and not self._is_airborne()
+            text = self._stuck_message() if stuck else f"{state.value} lasted {elapsed:.1f} s"
             events.append(Fault(Event.TIMEOUT, text))
         return events
 
-    def _stuck(self) -> str:
+    def _stuck_message(self) -> str:
         return self._take_off.stuck(self.maps)
 
     def _limit(self, state: State) -> float:
@@ -316,31 +317,32 @@ class Flight:
         self.note("transition", self._now, before=before.state.value, after=entered.value, events=names)
         if entered is State.FLY and before.state is State.RAMP:
             self.controller.reset()
-            self._commands, self._needed = None, self._take_off.needed([one.quaternion for one in self._states])
+            self._commands, self._hover_scale = None, self._take_off.needed([one.quaternion for one in self._states])
         if entered is State.LAND and before.state is not State.HOLD:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
-            highest = max(filter(math.isfinite, self._heights), default=0.0)  # the fault may be a jump of the height
+            highest = max(filter(math.isfinite, self._heights), default=0.0)  # the newest height may be the fault
             self._descend_for = self.settings.times.descent_limit(highest)
-            self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
+            self._plan = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._hold(faults)
 
     def _hold(self, faults: list[Fault]) -> None:
-        """Plan the time until a drone that may not hear is stopped by its own firmware."""
+        """Plan the thrust until the firmware of a drone that may not hear stops it."""
         self._holds += 1
-        self._back = Sustained(self.settings.limits.fresh)
+        self._recovered = Sustained(self.settings.limits.fresh)
         age = max((value for value in self._ages if math.isfinite(value)), default=0.0)
         if any(fault.event in (Event.UNHEARD, Event.FROZEN) for fault in faults):
             heard = [watch.heard for watch in self._monitor.uplinks if math.isfinite(watch.heard)]
             age = self._now - min(heard, default=self._now)
         self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
-        # Gently: a drone that does not hear keeps its thrust, and the other must not sink away from it.
-        self._shares = setpoints.blind_shares(self._last_known_state(), age, self.settings.period, setpoints.GENTLE)
+        # Gently: a drone that does not hear keeps its thrust, and the other must not descend much faster.
+        self._plan = setpoints.blind_shares(self._last_known_state(), age, self.settings.period, setpoints.GENTLE)
 
-    # What is sent.
+    # Output.
 
-    def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+    def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+        """Setpoints of leader and follower in the supervisor's state; `mapped` are those of the controllers."""
         state = self.supervisor.state
         if state in GUIDED:
             return [one.setpoint for one in mapped] if mapped else list(self._sent)
@@ -351,10 +353,10 @@ class Flight:
             return self._take_off.wanted(self.elapsed, rising, self._height(rising), self.maps)
         if state not in (State.DESCEND, State.HOLD):
             return [ZERO, ZERO]
-        # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
+        # The same for both drones: brake sideways and sink by the measured velocity, by the plan if there is none.
         seen, tilt = self._trusted(), (0.0, 0.0)
         if state is State.HOLD and not any(map(operator.and_, self._monitor.estimators.trusted, self._fresh)):
-            seen = None  # it is of a moment ago
+            seen = None  # no trusted estimate is fresh
         if seen is not None and not (self.settings.stand or self._monitor.estimators.contradiction):
             tilt = setpoints.brake(seen.velocity)
         if seen is not None and state is State.DESCEND:
@@ -362,11 +364,12 @@ class Flight:
         elif seen is not None:
             share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
-            share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
+            share = self._plan[min(int(self.elapsed / self.settings.period), len(self._plan) - 1)]
         shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
         return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
+        """Update the hover thrusts, and send setpoints and the commands of the supervisor's state."""
         state, dry = self.supervisor.state, self.settings.dry_run
         if state is State.RAMP:
             rises = zip(wanted, self.maps, strict=True)
@@ -384,7 +387,7 @@ class Flight:
             elif state is State.KILL and not dry:
                 link.command(packets.EMERGENCY_STOP)
             if state in (State.STOP, State.DONE) and sometimes and not own.info & packets.AUTO_ARMED:
-                link.command(packets.DISARM)  # its motors idle until then; one that arms itself would arm again
+                link.command(packets.DISARM)  # motors idle until disarmed; one that arms itself would arm again
             elif state is State.ARM and sometimes:
                 link.command(packets.ARM)
             self._send(link, watch, ZERO if dry else value)
@@ -395,10 +398,10 @@ class Flight:
 
     def _record(self, sent: list[Setpoint], late: float, missed: int) -> None:
         goal, state = self.goal(self._now), self.supervisor.state
-        laws = self._commands._asdict() if self._commands is not None and state in GUIDED else {}
-        hidden = laws.pop("hidden", None)
+        control = self._commands._asdict() if self._commands is not None and state in GUIDED else {}
+        hidden = control.pop("hidden", None)
         if hidden is not None:
-            laws["hidden"] = np.round(hidden, HIDDEN_DECIMALS)
-        self.note("tick", self._now, state=state.value, goal=goal, sent=sent, ages=self._ages, late=late, **laws)
+            control["hidden"] = np.round(hidden, HIDDEN_DECIMALS)
+        self.note("tick", self._now, state=state.value, goal=goal, sent=sent, ages=self._ages, late=late, **control)
         shown = self._states, self._ages, (sent[0], sent[1]), late, missed
         self.view = View(self._now - self._start, self.supervisor, *shown, self.carry)

@@ -1,8 +1,8 @@
 """The flight log: a file of JSON lines, with one writer and one reader.
 
-Every line has "t", seconds of the monotonic clock, and "kind"; `log_schema` says which kinds there are. `Journal`
-writes in a thread of its own and flushes as it goes, so that the log is readable after a kill -9. `Tail` reads a log
-that grows, `read` a whole one, or what another program recorded (`log_import`); `recording` makes a flight of it.
+Every line has "t", seconds of the monotonic clock, and "kind", one of `log_schema.KINDS`. `Journal` writes in a
+separate thread and flushes after each batch, so that the log is readable after a kill -9. `Tail` reads a growing log,
+`read` a whole one or a recording of another program (`log_import`); `recording` turns the records into arrays.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from mjxfly.setpoints import CURVE_NAMES
 SYNC_PERIOD = 1.0  # [s] between two fsyncs: a killed process loses nothing that was flushed, a power cut this much
 CHUNK = 2**20  # bytes read at once
 LONGEST_LINE = 2**20  # bytes
-STREAMS = ("tick", "state", "health")  # kinds that come in a steady stream, of each drone its own
+STREAMS = ("tick", "state", "health")  # periodic kinds, one stream per drone, whose times must increase
 
 
 class Journal:
-    """Takes notes from any thread without ever blocking it. A context manager."""
+    """Writes the flight log. Any thread may add records without blocking. A context manager."""
 
     def __init__(self, path: Path | None, **header: Any):
-        """Open the new file `path` (None: keep nothing); raise OSError if it exists or cannot be written.
+        """Create the file `path` (None: keep nothing). Raises OSError if it exists or cannot be written.
 
-        One that ends in .mcap is written by a process of its own, `log_export`.
+        A file that ends in .mcap is written by a separate process, `log_export`.
         """
         self._recorder = _start_recorder(path) if path and path.suffix == ".mcap" else None
         if self._recorder is not None:
@@ -61,12 +61,12 @@ class Journal:
         self.close()
 
     def note(self, kind: str, t: float | None = None, **fields: Any) -> None:
-        """Add one record of a `kind` in `log_schema.KINDS`; returns at once."""
+        """Queue one record of a `kind` in `log_schema.KINDS`; returns at once."""
         if self._stream is not None:
             self._queue.put({"t": clock.now() if t is None else t, "kind": kind, **fields})
 
     def close(self) -> None:
-        """Write what waits and close the file."""
+        """Write the queued records and close the file."""
         self._queue.put(None)
         self._thread.join(timeout=5)
         if self._recorder is not None:
@@ -81,7 +81,7 @@ class Journal:
                 while True:
                     records.append(self._queue.get_nowait())
             done = None in records
-            text = "".join(json.dumps(record, default=_plain) + "\n" for record in records if record is not None)
+            text = "".join(json.dumps(record, default=_to_json) + "\n" for record in records if record is not None)
             try:
                 if self._stream is not None and text:
                     self._stream.write(text)
@@ -97,35 +97,35 @@ class Journal:
 
 
 def _start_recorder(path: Path) -> subprocess.Popen[str]:
-    """The process that makes an MCAP file `path` of lines. Ctrl-C does not reach it: it ends when its input does."""
+    """A process that writes the lines on its input as the MCAP file `path`. It ends with its input, not by Ctrl-C."""
     with path.open("xb") as file:
         command = [sys.executable, "-m", "mjxfly.log_export"]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file, start_new_session=True, encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
-    """JSON for NumPy's arrays and numbers."""
+def _to_json(value: Any) -> Any:
+    """NumPy arrays and scalars as Python values for JSON."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 class Tail:
-    """Reads a log while it grows; it need not exist yet. The first record that it gives is the header."""
+    """Reads a log while it grows; the file need not exist yet. The first record returned is the header."""
 
     def __init__(self, path: Path, stream: BinaryIO | None = None):
-        """Read the file `path`, or the open `stream` which is called so."""
+        """Read the file `path`, or the open `stream`; messages then call it `path`."""
         self.path = path
-        self.lines: list[bytes] = []  # that hold the records read last
-        self.damaged: list[str] = []  # one sentence for each line that is no record of the schema, without a full stop
+        self.lines: list[bytes] = []  # of the records returned last
+        self.damaged: list[str] = []  # a message for each line that is not a record of the schema
         self._stream = stream
-        self.misplaced: str | None = None  # the first record whose time goes back, one sentence without a full stop
+        self.misplaced: str | None = None  # message on the first record whose time goes back
         self._rest, self._lines, self._begun = b"", 0, False
-        self._times: dict[tuple[str, Any], float] = {}  # of the newest record of every stream
+        self._times: dict[tuple[str, Any], float] = {}  # [s] of the newest record of every stream
 
     def read(self) -> list[Record] | None:
-        """The records that were added, a chunk at most; None if nothing was. A torn last line waits for its rest.
+        """New records, from at most `CHUNK` bytes; None if the file has not grown. An incomplete last line is kept.
 
-        Lines that are no records of the schema are left out, and ticks and states whose time does not follow. Raises
-        InputError: this is no flight log, or one of another schema, or of a firmware whose force curve is not known.
+        Lines that are not records of the schema are skipped, and so are streamed records whose time does not increase.
+        Raises InputError if this is no flight log, or has another schema or an unknown force curve.
         """
         try:
             added = self._added()
@@ -148,14 +148,14 @@ class Tail:
 
     @property
     def torn(self) -> bool:
-        """Whether the last line has no end."""
+        """Whether the last line is incomplete."""
         return bool(self._rest)
 
     def _added(self) -> bytes:
         if self._stream is None:
             if not self.path.exists():
                 return b""
-            if not self.path.is_file():  # a pipe or a device would be waited for
+            if not self.path.is_file():  # reading a pipe or a device would block
                 raise InputError(f"{self.path} is not a flight log: it is no file")
             self._stream = self.path.open("rb")
         return self._stream.read(CHUNK)
@@ -178,10 +178,10 @@ class Tail:
         except ValueError as error:
             self.damaged.append(f"line {self._lines} is damaged: {error}")
             return None
-        return None if record is None or self._misplaces(record) else self._checked(record)
+        return None if record is None or self._is_out_of_order(record) else self._checked(record)
 
-    def _misplaces(self, record: Record) -> bool:
-        """Whether `record` does not follow the one before it in its stream: one thread writes each, in order."""
+    def _is_out_of_order(self, record: Record) -> bool:
+        """Whether `record` is out of order in its stream. Each stream is written in order, by one thread."""
         if record["kind"] == "header":
             self.misplaced = self.misplaced or f"line {self._lines} begins another log"
             return True
@@ -215,7 +215,7 @@ class Tail:
         return self._checked(header)
 
     def _checked(self, record: Record | None) -> Record | None:
-        """`record` itself. Raises InputError if it names a force curve that is not known."""
+        """`record` itself. Raises InputError if it names an unknown force curve."""
         named = record if record is not None and record["kind"] in ("header", "thrust") else {}
         curve = named.get("curve", CURVE_NAMES[0])
         if curve not in CURVE_NAMES:
@@ -227,11 +227,11 @@ class Tail:
 
 
 def read(path: Path, remark: Callable[[str], None] | None = None, assumed: Config | None = None) -> Iterator[Record]:
-    """Every record of a whole log, the header first; a torn last one is left out, as is any line that is no record.
+    """Every record of a whole log, the header first, without damaged lines, an incomplete last line and duplicates.
 
-    A tick or state that is there twice is left out, too. `remark` is called with what is left out. What is no log of
-    ours but `log_import` reads is taken to be of the rig and the gains of `assumed`. Raises InputError with one
-    sentence if there is no log, or if its clock goes back: then nothing says when the rest happened.
+    `remark` is called with a note on what was skipped. A recording of another program, which `log_import` reads, is
+    taken to be of the rig and gains of `assumed`. Raises InputError with one sentence if there is no log, or if its
+    clock goes back, since the time of the rest is then unknown.
     """
     if not log_import.is_foreign(path):
         yield from (record for _, record in read_lines(path, remark))
@@ -246,7 +246,7 @@ def read(path: Path, remark: Callable[[str], None] | None = None, assumed: Confi
 def read_lines(
     path: Path, remark: Callable[[str], None] | None = None, stream: BinaryIO | None = None
 ) -> Iterator[tuple[bytes, Record]]:
-    """Every record of the whole log in the file `path`, or the `stream` called so, after its line; see `read`."""
+    """(line, record) for every record of the log in the file `path`, or in `stream`; see `read`."""
     if stream is None and not path.exists():
         raise InputError(f"flight log {path} cannot be read: No such file or directory")
     with contextlib.closing(Tail(path, stream)) as tail:

@@ -1,6 +1,6 @@
-"""Whether the batteries carry the pair for as long as a landing takes, by the largest thrust at their voltage. Pure.
+"""Whether the batteries can carry the pair until it has landed, by the largest thrust at their voltage. Pure.
 
-The low battery of `Limits` is a matter of seconds; a cell that gives way takes the lift within less than one.
+The battery limit of `Limits` reacts within seconds; a failing cell loses its lift within less than one.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, Fault
 from mjxfly.telemetry import ObjectState, Rig
 
-RESERVE = 0.15  # [V] of a battery in hover above that at which full power just carries: full power takes as much more
-SAMPLES = 5  # voltages whose median counts, at one a tick
-WINDOW = 0.5  # [s] over which a voltage falls, or does not
-SCARCE = 1.05  # of its weight, below which a drone is given all that it can lift
-ALL = 1.2  # share of hover that is asked of it then
-LEVELLING = (2.5, 1.0)  # shares of hover by which an end of the stick is let down, per m and per m/s that it is up
-CLIMBS = 0.25  # [m/s] upward that a pair without lift cannot reach
-SETTLE = 0.5  # [s] that a landing takes beyond its way down
+RESERVE = 0.15  # [V] above the voltage at which full power carries the weight; full power lowers it by as much
+SAMPLES = 5  # ticks, over which the median voltage is taken
+WINDOW = 0.5  # [s] over which the rate of the voltage is measured
+SCARCE = 1.05  # lift over weight below which a drone gets full thrust in a descent
+ALL = 1.2  # full thrust in a descent, over hover thrust
+LEVELLING = (2.5, 1.0)  # thrust over hover taken from the higher end of the stick, per m and per m/s
+CLIMBS = 0.25  # [m/s] vertical speed that proves that there is lift
+SETTLE = 0.5  # [s] of a landing beyond the time of its descent
 
 
 class LiftWatch:
-    """One for both drones. `update` once a tick in the air."""
+    """Watches the lift of both drones. `update` once a tick in the air."""
 
     def __init__(self, motor: Motor):
         self._motor = motor
         self._raw = [collections.deque[float](maxlen=SAMPLES) for _ in NAMES]
         self._seen: list[collections.deque[tuple[float, float]]] = [collections.deque() for _ in NAMES]
-        self.shares = [np.inf, np.inf]  # of what it carries, the most that each drone can lift
-        self._disproved = False  # whether a pair without lift was seen to climb
+        self.shares = [np.inf, np.inf]  # largest lift of each drone over the weight that it carries
+        self._disproved = False  # whether a pair said to lack lift has climbed
 
     @property
     def share(self) -> float:
-        """That of the weaker one."""
+        """Largest lift over weight of the weaker drone."""
         return min(self.shares)
 
     def update(
         self, voltages: Sequence[float], maps: Sequence[CommandMap], height: float, speed: float, now: float
     ) -> list[Fault]:
-        """What is wrong at `now` [s]: batteries of `voltages` [V] lose lift before a descent from `height` [m] ends.
+        """Faults at `now` [s] of batteries, `voltages` (2,) [V], that would fail before a descent ends.
 
-        `speed` [m/s] is that of the descent.
+        The descent is from `height` [m] at `speed` [m/s].
         """
         shares, faults, needed = [], [], max(height, 0.0) / speed + SETTLE
         for name, raw, seen, volts, own in zip(NAMES, self._raw, self._seen, voltages, maps, strict=True):
@@ -70,12 +70,12 @@ class LiftWatch:
         return faults
 
     def shared(self, wanted: float, seen: ObjectState | None, rig: Rig) -> list[float]:
-        """Shares of hover for leader and follower in a descent that wants `wanted`, the same of both.
+        """Thrust over hover thrust of leader and follower in a descent; `wanted` for both if there is lift enough.
 
-        Where lift is scarce a drone that lacks it gives all it has, since to sink at leisure would cost speed. One that
-        does not lack it lifts no more than the other, or the stick turns over. What a weak drone gives lags, and is
-        spent on its attitude too, so the end of the stick that is `seen` to rise is let down. A pair that is `seen` to
-        climb has lift enough, whatever its voltage reads, for the rest of the flight.
+        A drone that lacks lift gets full thrust, since it would fall faster with less. The other one lifts no more than
+        the weak one, or the stick would turn over. The weak drone's thrust lags and also controls its attitude, so the
+        higher end of the stick, by the object's state `seen`, gets less. A pair that climbs has lift enough for the
+        rest of the flight, whatever the voltage.
         """
         self._disproved = self._disproved or (seen is not None and float(seen.velocity[2]) > CLIMBS)
         if self.share > SCARCE or self._disproved:

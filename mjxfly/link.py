@@ -1,6 +1,6 @@
-"""One drone over cflib. Everything that may block does so in a thread of its own, and under a deadline.
+"""One drone over cflib. Calls that may block run in separate threads with a deadline.
 
-cflib is imported when a link is opened, so that all else here works without it.
+cflib is imported when a link is opened, so that this module can be imported without it.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from mjxfly.packets import Packet, PacketError
 from mjxfly.process import bounded, wait_until
 from mjxfly.telemetry import HealthSample, Note, SensedSample, Telemetry
 
-Variable = tuple[str, str | None]  # name and type of a log variable; None: as the firmware has it
+Variable = tuple[str, str | None]  # name and type of a log variable; None: the firmware's type
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
 DEADLINES = Deadlines()
-ATTEMPTS, REPEAT = 8, 0.25  # of a request, and how long each answer may take [s]
-PATIENCE = 4  # attempts to start a log block until it is made anew
-QUIET = 0.1  # [s] without anything to send, after which a ping goes out
+ATTEMPTS, REPEAT = 8, 0.25  # of a request, and time limit of each answer [s]
+PATIENCE = 4  # attempts to start a log block before it is deleted and created again
+QUIET = 0.1  # [s] without anything to send after which a ping is sent
 REVISION = ("firmware.revision0", "firmware.revision1", "firmware.modified")
 
 
 class Link:
-    """One drone: newest state, newest setpoint out, parameters. `send` and `command` never block."""
+    """One drone: receives its state, sends setpoints, commands and parameters. `send` and `command` never block."""
 
     def __init__(self, uri: str, name: str, note: Note, deadlines: Deadlines = DEADLINES, twin: bool = False):
-        """Of the drone `name` at `uri`. Firmwares differ in what they list; a `twin` must list all it is asked for."""
+        """Link to the drone `name` at `uri`. A `twin` must list every variable asked for; firmware need not."""
         self.uri, self.name = uri, name
         self.telemetry = Telemetry()
         self.lost: str | None = None  # why, once the link has ended
-        self.overwritten = self.sent = 0
+        self.overwritten = self.sent = 0  # setpoints replaced before they were sent; packets sent, without poses
         self.identity = Identity()
-        self.busy: bool | str = False  # with `write_later`: True while writing, else why it failed
+        self.busy: bool | str = False  # of `write_later`: True while writing, a text if it failed
         self._note, self._deadlines, self._twin = note, deadlines, twin
         self._wake = threading.Condition()
         self._setpoint: Packet | None = None
@@ -55,10 +55,10 @@ class Link:
         self._sender = threading.Thread(target=self._send_all, name=f"sender {name}", daemon=True)
         self.parameters = Parameters(name, self._element, self._request, deadlines.parameter)
 
-    # Before flight; these may block up to their deadlines.
+    # Before flight: these block up to their deadlines.
 
     def open(self, progress: Callable[[str], None] = lambda text: None) -> None:
-        """Connect, with both tables of contents, which are cached; `progress` gets lines to show. Raises LinkError."""
+        """Connect and get both tables of contents, which are cached; `progress` receives messages. Raises LinkError."""
         started = clock.now()
         self._crazyflie = connect(self.uri, self.name, self._deadlines, progress, self._end, self._console)
         self._driver = self._crazyflie.link
@@ -70,7 +70,7 @@ class Link:
         self._note("console", drone=self.name, text=text)
 
     def _identify(self, seconds: float) -> None:
-        """Ask for the firmware's version and the drone's kind. Raises LinkError for a protocol that is too old."""
+        """Ask for firmware version and kind of drone, and log them. Raises LinkError if the protocol is too old."""
         answers: dict[int, str] = {}
         both = threading.Event()
 
@@ -107,14 +107,14 @@ class Link:
         return None if found is None else Element(found.ident, found.pytype, found.access == found.RO_ACCESS)
 
     def _find(self, table: Any, name: str) -> Any:
-        """The entry of `name`, None if the firmware lists none. Raises LinkError for a twin that lacks it."""
+        """cflib's table entry for `name`, None if the firmware lacks it. Raises LinkError if a twin lacks it."""
         found = table.toc.get_element_by_complete_name(name)
         if found is None and self._twin:
             raise LinkError(f"the twin has no {name}, which this flight asks the {self.name} for; a rehearsal needs it")
         return found
 
     def start_states(self) -> None:
-        """Have state, what is sensed, health sent at 100, 50, 20 Hz; wait for the first of each. Raises LinkError."""
+        """Log state, sensed values and health at 100, 50, 20 Hz; wait for one packet of each. Raises LinkError."""
         block = self._log_block("newest", packets.STATE_VARIABLES, 10)
         self._block = block.id
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)
@@ -129,10 +129,10 @@ class Link:
         self._start(blocks, lambda title: getattr(self.telemetry, title))
 
     def _start(self, blocks: Sequence[Any], newest: Callable[[str], Any]) -> None:
-        """Start log `blocks` until each has sent something, which `newest` gives by its title. Raises LinkError.
+        """Start log `blocks` and repeat until each has sent a packet: `newest` of its title. Raises LinkError.
 
-        A firmware drops requests while its queue is full, and cflib does not repeat them. A block that stays silent is
-        deleted and made anew; only a packet that comes after it is gone then counts.
+        The firmware drops requests while its queue is full, and cflib does not repeat them. A block that stays silent
+        is deleted and created again; only packets that arrive after its deletion then count.
         """
         deadline, old, leaving = clock.now() + self._deadlines.first_state, dict[str, Any](), set[str]()
         for attempt in itertools.count(1):
@@ -161,9 +161,9 @@ class Link:
         return [*packets.VARIANCES, *motors, *self._listed([packets.ACTING_THRUST])]
 
     def read_logs(self, names: Sequence[str]) -> dict[str, float]:
-        """Values of those of the log variables `names` that the firmware lists, as one packet has them.
+        """Values of the log variables `names`, without those that the firmware does not list, from one packet.
 
-        Raises LinkError if none comes.
+        Raises LinkError if no packet arrives.
         """
         listed = self._listed([(name, None) for name in names])
         if not listed:
@@ -183,7 +183,7 @@ class Link:
             self._note("parameter", drone=self.name, name=name, value=value)
 
     def write_later(self, values: Mapping[str, float]) -> None:
-        """Write parameters in a thread of their own, while flying; `busy` tells how it went."""
+        """Write parameters in a separate thread, also in flight; `busy` has the state."""
 
         def write() -> None:
             try:
@@ -207,9 +207,9 @@ class Link:
         return block
 
     def _ask(self, request: Callable[[], Any]) -> Any:
-        """Make a `request` of cflib, whose sends wait without limit for a link that is dying; its refusal, if any.
+        """Call `request` of cflib; return the first argument of an exception that it raised, else None.
 
-        Raises LinkError if that takes too long.
+        Raises LinkError if it takes too long: sends of cflib on a dying link wait without limit.
         """
         refused: list[Any] = []
 
@@ -225,7 +225,7 @@ class Link:
         return refused[0] if refused else None
 
     def ask_app(self, packet: Packet) -> Reply:
-        """The answer of the app on board to `packet`, which is repeated until it comes. Raises LinkError."""
+        """Answer of the app on board to `packet`, which is sent up to `ATTEMPTS` times. Raises LinkError."""
         answers: list[Reply] = []
         heard = threading.Event()
 
@@ -245,58 +245,58 @@ class Link:
             self._crazyflie.remove_port_callback(packet.port, answered)
         raise LinkError(f"the app of the {self.name} does not answer; switch the drone off and on again")
 
-    # In flight; these never block.
+    # In flight: these never block.
 
     def send(self, packet: Packet) -> None:
-        """Put `packet` out as the newest setpoint; one that was not sent yet is dropped."""
+        """Send `packet` as the newest setpoint; it replaces one that still waits."""
         with self._queue():
             self.overwritten += self._setpoint is not None
             self._setpoint = packet
 
     def command(self, packet: Packet) -> None:
-        """Queue `packet` before any setpoint; an older setpoint that still waits is dropped."""
+        """Queue `packet` ahead of later setpoints; a setpoint that still waits is dropped."""
         with self._queue():
             self._setpoint = None
             if packet == packets.EMERGENCY_STOP:
-                self._commands.clear()  # nothing may be before it, or in its place
+                self._commands.clear()  # nothing may delay it or fill the queue
             if len(self._commands) < 20:
                 self._commands.append(packet)
 
     def pose(self, packet: Packet) -> None:
-        """Put `packet` out as the newest measured pose, once no command and no setpoint waits; an older one is dropped.
+        """Send `packet` as the newest measured pose once no command or setpoint waits; it replaces one that waits.
 
-        Poses that wait do not count in `stuck_for`: they are the first that a busy radio may lose.
+        Waiting poses do not count in `stuck_for`: a busy radio drops them first.
         """
         with self._wake:
             self._pose = packet
             self._wake.notify()
 
     def _request(self, packet: Packet) -> None:
-        """Queue `packet` behind the commands that wait; a setpoint that waits stays."""
+        """Queue `packet` behind waiting commands; a waiting setpoint is kept."""
         with self._queue():
             self._commands.append(packet)
 
     @contextlib.contextmanager
     def _queue(self) -> Iterator[None]:
-        """Change what waits to be sent, and wake the sender."""
+        """Hold the sender's lock to change what waits, then wake the sender."""
         with self._wake:
             yield
             self._waiting_since = self._waiting_since or clock.now()
             self._wake.notify()
 
     def stuck_for(self, now: float) -> float:
-        """How long the sender has been unable to send what waits [s]."""
+        """Time for which waiting packets could not be sent [s]."""
         since = self._waiting_since
         return 0.0 if since is None else now - since
 
     def close(self) -> None:
-        """End the link: cflib sends one zero setpoint. Returns after the deadline at the latest."""
+        """Close the link; cflib sends one zero setpoint. Returns after the deadline at the latest."""
         with self._wake:
             self._closing = True
             self._wake.notify()
         if self._crazyflie is None:
             return
-        self._crazyflie.incoming.stop()  # with the next packet; close_link tells it too late and waits 1 s for it
+        self._crazyflie.incoming.stop()  # ends with the next packet; close_link stops it later and waits 1 s for it
         if not bounded(self._crazyflie.close_link, self._deadlines.close):
             self._note("warning", text=f"the link of the {self.name} did not close in time")
 
@@ -319,10 +319,10 @@ class Link:
             wire = CRTPPacket()
             wire.set_header(packet.port, packet.channel)
             wire.data = packet.data
-            # Not through Crazyflie.send_packet: its lock stays held when a driver reports an error from inside.
+            # Not through Crazyflie.send_packet, whose lock stays held if a driver reports an error while sending.
             try:
                 self._driver.send_packet(wire)
-            except Exception as error:  # whatever a driver raises, this link is at its end and the loop must hear of it
+            except Exception as error:  # whatever a driver raises, the link has ended and the control loop must know
                 self._end(f"{type(error).__name__}: {error}")
             self.sent += packet.port != packets.POSE_PORT
             with self._wake:
@@ -330,7 +330,7 @@ class Link:
                 self._waiting_since = clock.now() if waiting else None
 
     def _receive(self, packet: Any) -> None:
-        """A log packet, in cflib's thread; whatever is not a whole state is counted and dropped."""
+        """Take a log packet, in cflib's thread; a damaged state is counted and dropped."""
         arrival, data = clock.now(), bytes(packet.data)
         if len(data) < 4 or data[0] != self._block:
             return

@@ -1,4 +1,4 @@
-"""What was flown, `python -m mjxfly.log LOG OUT`: figures and numbers, or a file for other programs.
+"""What was flown, `python -m mjxfly.log LOG OUT`: figures and errors, or a file for other programs.
 
 LOG is a flight log (.jsonl), a bag or cfclient's folder. OUT ends in .mcap (ROS 2 messages; of .jsonl alone), .csv or
 .parquet; or it is a new directory, for figures of the flight beside the simulation of the same commands.
@@ -29,12 +29,12 @@ from mjxfly.recording import Recording, fly_again, read_recording
 from mjxfly.twin.conditions import Conditions
 
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
-DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
+DIVERGED = 0.25  # [m] difference from which the open-loop simulation is not plotted any more
 ASSUMED = tuple((kind, index, f"assumed {text}" if kind == "cg_offset" else text) for kind, index, text in PANELS)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Draw or export a log; return the exit code."""
+    """Plot or export a log; return the exit code."""
     about, formats = (__doc__ or "").split("\n\n")
     parser = cli.make_parser("python -m mjxfly.log", about, epilog=formats)
     parser.add_argument("log", type=Path, metavar="LOG", help="flight log, bag, or folder of cfclient's logs")
@@ -44,10 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
     about = "of figures: screen (default), or paper: PDF of a column's width"
     parser.add_argument("--style", choices=STYLES, default="screen", help=about)
     options = parser.parse_args(arguments)
-    return cli.run_command(lambda: _draw_or_export(options))
+    return cli.run_command(lambda: _plot_or_export(options))
 
 
-def _draw_or_export(options: argparse.Namespace) -> int:
+def _plot_or_export(options: argparse.Namespace) -> int:
     out, kind = options.out, options.out.suffix
     if not kind:
         return evaluate_log(options.log, out, options.style, options.plant)
@@ -63,9 +63,9 @@ def _draw_or_export(options: argparse.Namespace) -> int:
 
 
 def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None) -> int:
-    """Draw the log `path` into the new directory `out`, print how far the simulation is from it; the exit code.
+    """Plot the log `path` into the new directory `out` and print the simulation's errors; return the exit code.
 
-    `plant` is the rig that flew, if the log does not say. Raises InputError if it does.
+    `plant` is the rig that flew, for a log that does not name it. Raises InputError if the log does.
     """
     recording = read_recording(path, cli.plant_setup(plant, "flight"))
     if plant is not None and recording.policy != UNKNOWN:
@@ -82,17 +82,17 @@ def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None
 
 
 def result_of(recording: Recording, name: str) -> Result:
-    """A recording as a result; the scenario is what the simulation assumed."""
+    """A recording as a result, with the scenario that the simulation assumes."""
     config, flight = recording.config, trajectory_of(recording)
-    met = Conditions.of(config)
-    numbers = (met.cg_speed, met.cg_amplitude, met.object_mass)
-    scenario = Scenario(*numbers, ball_start=met.ball, seconds=float(flight.time[-1]))
+    assumed = Conditions.of(config)
+    parameters = (assumed.cg_speed, assumed.cg_amplitude, assumed.object_mass)
+    scenario = Scenario(*parameters, ball_start=assumed.ball, seconds=float(flight.time[-1]))
     metrics = measure(flight, config.scenario.termination_distance, rotor_limits(config.plant, [scenario])[0])
     return Result(name, scenario, metrics, flight, config.motion.kind)
 
 
 def trajectory_of(recording: Recording) -> Trajectory:
-    """A recording as a trajectory; what was not measured is NaN."""
+    """A recording as a trajectory; quantities that were not measured are NaN."""
     rows = len(recording.time)
     unknown = np.full((rows, 2, 3), np.nan)
     return Trajectory(
@@ -117,9 +117,9 @@ def trajectory_of(recording: Recording) -> Trajectory:
 
 
 def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
-    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file.
+    """Plot a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file.
 
-    The goal is drawn for the first `guided` rows. The log does not tell the object's mass and CG: they are assumed.
+    The goal is plotted for the first `guided` rows. Mass and CG of the object are assumed: the log lacks them.
     """
     out.mkdir(parents=True, exist_ok=True)
     both = [without_goal(recorded, guided), _cut(without_goal(simulated, guided), valid_rows(recorded, simulated))]
@@ -129,7 +129,7 @@ def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
 
 
 def differences(recorded: Result, simulated: Result) -> str:
-    """How far both are apart, moment by moment: a table."""
+    """A table of the largest differences between both flights until each of `MOMENTS`."""
     a, b = recorded.flight, simulated.flight
     moments = [moment for moment in MOMENTS if moment < a.time[-1]] + [float(a.time[-1])]
     lines = ["time s   position mm   height mm   roll deg   (largest difference until then)"]
@@ -137,8 +137,8 @@ def differences(recorded: Result, simulated: Result) -> str:
         rows = a.time <= moment
         apart = a.position[rows] - b.position[rows]
         roll = np.degrees(a.euler[rows, 0] - b.euler[rows, 0])
-        numbers = np.linalg.norm(apart, axis=1).max(), np.abs(apart[:, 2]).max(), np.abs(roll).max()
-        lines.append(f"{moment:6.1f}{1e3 * numbers[0]:14.1f}{1e3 * numbers[1]:12.1f}{numbers[2]:11.2f}")
+        largest = np.linalg.norm(apart, axis=1).max(), np.abs(apart[:, 2]).max(), np.abs(roll).max()
+        lines.append(f"{moment:6.1f}{1e3 * largest[0]:14.1f}{1e3 * largest[1]:12.1f}{largest[2]:11.2f}")
     known = valid_rows(recorded, simulated)
     if known < len(a.time):
         lines.append(
@@ -148,21 +148,21 @@ def differences(recorded: Result, simulated: Result) -> str:
 
 
 def valid_rows(recorded: Result, simulated: Result) -> int:
-    """For how many rows the simulation is less than `DIVERGED` from the recorded flight."""
+    """Number of rows before the simulation is `DIVERGED` or more from the recorded flight."""
     apart = np.linalg.norm(recorded.flight.position - simulated.flight.position, axis=1)
     lost = np.flatnonzero(~(apart < DIVERGED))
     return int(lost[0]) if len(lost) else len(apart)
 
 
 def without_goal(result: Result, rows: int) -> Result:
-    """`result` without a goal after `rows`: it was not flown to."""
+    """`result` with its goal NaN after the first `rows`, where it was not tracked."""
     target = np.array(result.flight.target, float)
     target[rows:] = np.nan
     return dataclasses.replace(result, flight=dataclasses.replace(result.flight, target=target))
 
 
 def _cut(result: Result, rows: int) -> Result:
-    """`result` with nothing to draw of its motion after `rows`."""
+    """`result` with its motion NaN after the first `rows`, so that it is not plotted."""
     flight, parts = result.flight, {}
     for name in ("position", "velocity", "euler", "cg_offset"):
         parts[name] = np.array(getattr(flight, name), float)

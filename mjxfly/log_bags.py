@@ -1,4 +1,4 @@
-"""rosbag2 bags, MCAP or SQLite, as series of numbers: read by rosbags, and as far as it goes where a file is cut."""
+"""Time series from rosbag2 bags, MCAP or SQLite, read by rosbags; of a truncated MCAP file the intact part."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mjxfly.log_unpack import Unpacking, check_tables
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 BAGS, COMPRESSED = (".mcap", ".db3"), ".zstd"
-CLOCKS = 0.05  # [s] by which stamps and times of receipt may differ as a rule
-ASTRAY = 1  # [s] by which one of them may: a stamp of 0 says that the message is of no time
-SHOWN = 6  # topics that a sentence names
+MAX_CLOCK_OFFSET = 0.05  # [s] largest median difference between stamps and times of receipt
+MAX_STAMP_ERROR = 1  # [s] largest difference of one message: a stamp of 0 means that it has none
+SHOWN = 6  # topics named in an error message
 
 
 class Found(NamedTuple):
-    """What a bag holds."""
+    """Contents of a bag."""
 
-    lines: bytes  # of a flight log of ours, empty: none
+    lines: bytes  # of our own flight log, empty if there is none
     series: Series
-    has: str  # its topics in words
+    has: str  # its topics and their types, for messages
 
 
 def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
-    """The bag `path`, a file or a folder. Raises InputError: it is none, is empty, or its clocks do not agree."""
+    """Read the bag `path`, a file or a folder. Raises InputError if it is none, is empty, or its clocks disagree."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -39,23 +39,23 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
     with tempfile.TemporaryDirectory() as spare, contextlib.ExitStack() as stack:
         try:
             stack.enter_context(unpacking.bounding())
-            files = [_whole(_unpacked(file, Path(spare), unpacking), Path(spare), remark, unpacking) for file in found]
+            files = [_intact(_plain(file, Path(spare), unpacking), Path(spare), remark, unpacking) for file in found]
             with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 return _contents(path, reader, unpacking)
         except InputError:
             raise
-        except Exception as error:  # of any of the libraries that read it
+        except Exception as error:  # the libraries raise many types
             unpacking.refuse()
             raise InputError(f"bag {path} cannot be read: {said(error)}") from None
 
 
 def is_bag(path: Path) -> bool:
-    """Whether `path` is called as a bag's file is, compressed or not."""
+    """Whether `path` has the suffix of a bag's file, compressed or not."""
     return path.name.removesuffix(COMPRESSED).endswith(BAGS)
 
 
 def _files(path: Path) -> list[Path]:
-    """The bag `path` itself, or the files of a folder; they hold all that its metadata.yaml says."""
+    """The file `path`, or the bag files in the folder; metadata.yaml is not needed. Raises InputError without any."""
     if path.is_file():
         return [path]
     inside = [path, *path.iterdir()] if path.is_dir() else [path]
@@ -69,16 +69,16 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
-def _unpacked(path: Path, spare: Path, unpacking: Unpacking) -> Path:
-    """`path`, or in the folder `spare` what it was compressed from."""
+def _plain(path: Path, spare: Path, unpacking: Unpacking) -> Path:
+    """`path`, or its decompressed copy in the folder `spare`."""
     if path.suffix != COMPRESSED:
         return path
     unpacking.copy(path, spare / path.stem)
     return spare / path.stem
 
 
-def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Unpacking) -> Path:
-    """`path`, or a copy in the folder `spare` of an MCAP file as far as it goes, if its end is missing."""
+def _intact(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Unpacking) -> Path:
+    """`path`, or a copy of the intact part in the folder `spare` if it is a truncated MCAP file."""
     if path.suffix == ".db3":
         check_tables(path)
     if path.suffix != ".mcap":
@@ -88,15 +88,15 @@ def _whole(path: Path, spare: Path, remark: Callable[[str], None], unpacking: Un
         if begin != MAGIC:
             what = "is empty" if not begin else f"begins with {begin!r}"
             raise InputError(f"bag {path} {what}; expected an MCAP file, which begins with {MAGIC!r}")
-    if _ends(path):
+    if _has_footer(path):
         return path
     copy = spare / f"whole-{path.name}"
     remark(f"it is cut short, without a footer: {_copy_sound(path, copy, unpacking)} messages are whole")
     return copy
 
 
-def _ends(path: Path) -> bool:
-    """Whether the MCAP file `path` has an end."""
+def _has_footer(path: Path) -> bool:
+    """Whether the MCAP file `path` has its closing magic bytes."""
     with path.open("rb") as stream:
         size = stream.seek(0, 2)
         stream.seek(max(0, size - len(MAGIC)))
@@ -104,9 +104,9 @@ def _ends(path: Path) -> bool:
 
 
 def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
-    """Write what comes before the first damage of the MCAP file `path` to the new file `copy`; how many messages.
+    """Copy the part of the MCAP file `path` before the first damage to the new file `copy`; return the message count.
 
-    Raises InputError: not even the header does.
+    Raises InputError if the header is damaged.
     """
     from mcap.records import Channel, Header, Message, Schema
     from mcap.writer import Writer
@@ -114,7 +114,7 @@ def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
     count, schemas, channels, begun = 0, {0: 0}, dict[int, int](), False
     with path.open("rb") as stream, copy.open("xb") as target:
         writer = Writer(target)
-        with contextlib.suppress(Exception):  # whatever a record raises that is not whole
+        with contextlib.suppress(Exception):  # of the first damaged record
             for one in unpacking.records(stream, path.stat().st_size):
                 if isinstance(one, Header):
                     writer.start(one.profile)
@@ -135,44 +135,45 @@ def _copy_sound(path: Path, copy: Path, unpacking: Unpacking) -> int:
 
 
 def _contents(path: Path, reader: Any, unpacking: Unpacking) -> Found:
+    """Read all known topics of an open bag. Raises InputError if it is empty or its clocks disagree."""
     topics = {one.topic: one.msgtype.replace("/msg/", "/") for one in reader.connections}
     has = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:SHOWN])
     if reader.message_count == 0:
         raise InputError(f"bag {path} is empty: it holds no message; expected those of a flight")
     if f"/{HEADER}" in topics:
-        # A bag is sorted by time, and the first line may have a later one.
+        # A bag is sorted by time, and the header need not be its earliest line.
         lines = [
-            part[RECORD] for name in (HEADER, RECORD) for *_, part in _parts(path, reader, unpacking, {f"/{name}"})
+            part[RECORD] for name in (HEADER, RECORD) for *_, part in _messages(path, reader, unpacking, {f"/{name}"})
         ]
         return Found(b"".join(line + b"\n" for line in lines), {}, has)
     found: dict[tuple[str, str, str], tuple[list[float], list[Any]]] = {}
     apart: dict[str, list[float]] = {}
-    wanted = {topic for topic, kind in topics.items() if (one := TOPICS.get(_last(topic))) and one.type == kind}
-    for topic, received, drone, header, values in _parts(path, reader, unpacking, wanted):
+    wanted = {topic for topic, kind in topics.items() if (one := TOPICS.get(_last_part(topic))) and one.type == kind}
+    for topic, received, drone, header, values in _messages(path, reader, unpacking, wanted):
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
-        stamped = abs(received - now) <= ASTRAY * 10**9
-        for quantity, numbers in values.items():
-            _check_width(path, topic, quantity, len(numbers))
+        stamped = abs(received - now) <= MAX_STAMP_ERROR * 10**9
+        for quantity, row in values.items():
+            _check_width(path, topic, quantity, len(row))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
             times.append(((now if stamped else received) - reader.start_time) * 1e-9)
-            rows.append(numbers if stamped else (np.nan,) * len(numbers))
+            rows.append(row if stamped else (np.nan,) * len(row))
     _check_clocks(path, apart)
     return Found(b"", _densest(found), has)
 
 
-def _last(topic: str) -> str:
+def _last_part(topic: str) -> str:
     return topic.rpartition("/")[2]
 
 
-def _parts(
+def _messages(
     path: Path, reader: Any, unpacking: Unpacking, topics: set[str]
 ) -> Iterator[tuple[str, int, str, Any, dict[str, Any]]]:
     """(topic, time of receipt [ns], drone, header or None, values by quantity) of all messages on `topics`."""
     wanted = [one for one in reader.connections if one.topic in topics]
     for connection, received, raw in reader.messages(wanted) if wanted else ():
         topic = connection.topic
-        known, message = TOPICS[_last(topic)], reader.deserialize(unpacking.message(raw), connection.msgtype)
+        known, message = TOPICS[_last_part(topic)], reader.deserialize(unpacking.message(raw), connection.msgtype)
         try:
             parts = list(known.take(message))
         except AttributeError as error:
@@ -180,30 +181,30 @@ def _parts(
                 f"bag {path}: {known.type} of {topic} has another definition than expected: {error}"
             ) from None
         for drone, header, values in parts:
-            yield topic, received, drone or _last(topic.rpartition("/")[0]), header, values
+            yield topic, received, drone or _last_part(topic.rpartition("/")[0]), header, values
 
 
 def _check_width(path: Path, topic: str, quantity: str, found: int) -> None:
     if found != WIDTHS[quantity]:
         variables = [name for name, one in VARIABLES.items() if one.quantity == quantity]
-        own = [name for name in variables if name.startswith(f"{_last(topic)}.")]
+        own = [name for name in variables if name.startswith(f"{_last_part(topic)}.")]
         raise InputError(f"bag {path}: {topic} has {found} values; expected {', '.join(own)}")
 
 
 def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:
     for topic, differences in apart.items():
         usual = float(np.median(differences))
-        if abs(usual) > CLOCKS:
+        if abs(usual) > MAX_CLOCK_OFFSET:
             raise InputError(
                 f"bag {path} is of two clocks: {topic} is stamped {usual:.3g} s before it was received; expected "
-                f"{CLOCKS:g} s or less, of a recorder on the machine that stamps, or of synchronised clocks"
+                f"{MAX_CLOCK_OFFSET:g} s or less, of a recorder on the machine that stamps, or of synchronised clocks"
             )
 
 
 def _densest(found: dict[tuple[str, str, str], tuple[list[float], list[Any]]]) -> Series:
-    """Of several topics for one quantity of a drone that with the most messages, in the order of time.
+    """Series by drone and quantity, sorted by time: of several topics with one quantity that with the most messages.
 
-    One of zeros, which nobody measured, comes last.
+    A topic with zeros only was not measured and is used if there is no other.
     """
     series: Series = {}
     for (drone, quantity, _), (times, rows) in sorted(

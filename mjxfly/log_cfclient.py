@@ -1,4 +1,4 @@
-"""Log blocks that cfclient wrote as CSV, of two drones, as series of numbers."""
+"""Time series of two drones from log blocks that cfclient wrote as CSV."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mjxfly.limits import NAMES
 from mjxfly.log_consistency import known
 from mjxfly.log_sources import VARIABLES, WIDTHS, Samples, Series
 
-LARGEST, MOST_COLUMNS = 64 * 2**20, 100  # bytes of a file: some hours of a log block, whose variables fit a packet
+LARGEST, MOST_COLUMNS = 64 * 2**20, 100  # of a file [bytes]: hours of a log block; a packet holds fewer variables
 
 
 def read_cfclient(path: Path, remark: Callable[[str], None]) -> Series:
-    """The folder `path` with the folders `leader` and `follower` of CSV files that cfclient wrote.
+    """Series by drone and quantity from the folders `leader` and `follower` in `path`, with CSV files of cfclient.
 
-    The times of each drone are those of its own clock; a number that is not there is NaN. Raises InputError: there are
-    none, or they are damaged.
+    Times [s] of each drone are on its own clock; missing values are NaN. Raises InputError if files are missing or
+    damaged.
     """
     return {name: _joined(path / name, _columns(path / name, remark)) for name in NAMES}
 
@@ -54,7 +54,7 @@ def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
         if twice := [name for name in head if head.count(name) > 1]:
             raise InputError(f"{file} has two columns {twice[0]}; expected one")
         try:
-            table = np.fromiter(_numbers(reader, len(head)), float).reshape(-1, len(head))
+            table = np.fromiter(_values(reader, len(head)), float).reshape(-1, len(head))
             kept = following((1e-3 * table[:, 0]).tolist())
             if len(kept) < 2:
                 raise ValueError("it holds fewer than two rows")
@@ -70,8 +70,8 @@ def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
     raise InputError(f"{file} is no text; expected cfclient's CSV")
 
 
-def _numbers(rows: Iterable[list[str]], width: int) -> Iterator[float]:
-    """The numbers of all `rows` but a last one that is short: cfclient was ended while it wrote. Raises ValueError."""
+def _values(rows: Iterable[list[str]], width: int) -> Iterator[float]:
+    """All values of `rows`, NaN if empty, without an incomplete last row. Raises ValueError for another bad row."""
     fault = ""
     for number, row in enumerate(rows, start=1):
         if not fault and len(row) == width:
@@ -83,7 +83,7 @@ def _numbers(rows: Iterable[list[str]], width: int) -> Iterator[float]:
 
 
 def _joined(folder: Path, columns: dict[str, Samples]) -> dict[str, Samples]:
-    """Quantities of which every number is there, at the times of their first one."""
+    """Quantities of which all components were logged, interpolated to the times of the first one."""
     parts: dict[tuple[str, int], Samples] = {}
     for name, one in VARIABLES.items():
         if name in columns:
@@ -100,7 +100,7 @@ def _joined(folder: Path, columns: dict[str, Samples]) -> dict[str, Samples]:
 
 
 def _at(time: np.ndarray, rows: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """(n,) the numbers `column` (m, 1) of other `rows` (m,) at `time`, NaN where there are none."""
+    """(n,) `column` (m, 1), sampled at times `rows` (m,), interpolated to `time` (n,); NaN in gaps."""
     there = np.isfinite(column[:, 0])
     if not there.any():
         return np.full(len(time), np.nan)

@@ -1,8 +1,8 @@
-"""Whether a recording agrees with itself: the axes and units of its velocities, and its clocks. Pure.
+"""Consistency of a recording: axes and units of its velocities and rates, and its clocks. Pure.
 
-A velocity is held against the positions beside it, and body rates against the attitudes: both must change as they say,
-in the axes that are meant and by the clock that stamps them. Two drones on one stick have the same body rates, and what
-both are sent lifts them a motor's lag later: that tells how the clocks of two drones and of their setpoints differ.
+Recorded velocities are compared with the change of the positions, body rates with the change of the attitudes. Two
+drones on one stick have the same body rates, which gives the offset between their clocks. Their vertical acceleration
+follows the thrust setpoints after the motors' lag, which gives the offset between setpoints and states.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from mjxfly.limits import NAMES
 from mjxfly.log_sources import Samples
 from mjxfly.packets import GRAVITY
 
-SILENCE = 0.1  # [s] between two rows from which on nothing is known between them
-UNEVEN = 0.1  # by which the length of an attitude's quaternion may differ from 1
-SPARSE = 2.5  # usual steps that may lie between two rows of a slower series
+SILENCE = 0.1  # [s] between two rows that counts as a gap
+UNEVEN = 0.1  # largest deviation of a quaternion's length from 1
+SPARSE = 2.5  # median steps between two rows that count as a gap in a slower series
 HORIZON = 0.2  # [s] over which motion is compared
-# Of 5 s of public flights of one drone over a radio (NanoBench), positions change by 0.94 to 1.21 of the estimated
-# velocities and attitudes by 0.82 to 1.20 of the rates, but never both by more or both by less; lags wander by 0.03 s.
-SURE = 0.8  # correlation from which on a ratio counts
-SCALE, UNIT = 1.12, 1.35  # factors from which on a ratio is wrong, if the other is so too, and by itself
+# In 5 s of public flights of one drone over a radio (NanoBench), positions change by 0.94 to 1.21 of the estimated
+# velocities, attitudes by 0.82 to 1.20 of the rates, but never both by more or both by less; lags vary by 0.03 s.
+MIN_CORRELATION = 0.8  # least correlation for a ratio to be used
+SCALE, UNIT = 1.12, 1.35  # factor at which both ratios together, or one alone, count as wrong
 
 GRID = 0.005  # [s]
-SMOOTH, SLOW = 0.1, 1.0  # [s] over which signals are averaged, and whose slower part is left out
-WINDOW, SEARCH = 3.0, 0.4  # [s] of a window whose lag is found, and how far from the whole recording's
-ALIKE, CLEAR = 0.5, 0.8  # correlation from which on two signals count as one, and from which on a window's lag does
-FARTHEST = 5.0  # [s] between the clocks of a recording that has but one
-NEAR = 0.04  # [s] by which two drones' clocks may differ; 0.02 s changes identified lag and inertia by 3 % and 1 %
-TURNING, LIFTING = 0.01, 0.06  # rms of body rates [rad/s] and of vertical acceleration [m/s2] in windows that tell
-MOVING = 0.1  # rms of what is said to change in [m/s] or [rad/s] from which on it must change so
-LIFT_LAGS = (0.015, 0.25)  # [s] from a setpoint to the acceleration: a motor's lag and a delay
+SMOOTH, SLOW = 0.1, 1.0  # [s] moving averages of the band-pass: smoothing, and the trend that is subtracted
+WINDOW, SEARCH = 3.0, 0.4  # [s] length of a window, and search range of its lag about that of the whole recording
+ALIKE, CLEAR = 0.5, 0.8  # least correlation of two whole signals that match, and of a window for its lag to count
+FARTHEST = 5.0  # [s] largest offset that is searched between the clocks of one recording
+NEAR = 0.04  # [s] allowed between two drones' clocks; 0.02 s changes identified lag and inertia by 3 % and 1 %
+TURNING, LIFTING = 0.01, 0.06  # least rms of body rates [rad/s], vertical acceleration [m/s2] in a window that counts
+MOVING = 0.1  # [m/s] or [rad/s] least rms of a motion whose ratio is judged
+LIFT_LAGS = (0.015, 0.25)  # [s] bounds of the time from setpoint to acceleration: motor lag and delay
 LIFT_CHANGE = 0.06  # [s] by which that may change within a flight
 
 
 def known(time: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(n,) whether each `time` is next to a row of a series with rows `at` (m,), or between two that are close."""
+    """(n,) whether each of `time` (n,) lies in no gap of a series sampled at times `at` (m,)."""
     limit = max(SILENCE, SPARSE * float(np.median(np.diff(at)))) if len(at) > 1 else SILENCE
     after = np.searchsorted(at, time)
     before, following = at[np.maximum(after - 1, 0)], at[np.minimum(after, len(at) - 1)]
@@ -50,14 +50,14 @@ def known(time: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 class Motion(NamedTuple):
-    """What changed within `HORIZON` and what was said to change, (m, 3) each, by second."""
+    """Mean rates over spans of `HORIZON`, (m, 3): `measured` from differences, `said` from the recorded rates."""
 
     measured: np.ndarray
     said: np.ndarray
 
     @property
     def size(self) -> float:
-        """Root mean square of what changed."""
+        """Root mean square of the measured rates."""
         return _rms(self.measured)
 
     @property
@@ -67,21 +67,21 @@ class Motion(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """What changed for what was said, 1 where both do not tell."""
+        """Measured over recorded rates, 1 if they do not correlate enough."""
         product = float((self.measured * self.said).sum())
         lengths = float(np.linalg.norm(self.measured)), float(np.linalg.norm(self.said))
-        return lengths[0] / lengths[1] if product > SURE * lengths[0] * lengths[1] > 0 else 1.0
+        return lengths[0] / lengths[1] if product > MIN_CORRELATION * lengths[0] * lengths[1] > 0 else 1.0
 
 
 def way(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Motion:
-    """That of positions (n, 3) [m] and velocities [m/s] in the same axes."""
+    """`Motion` of positions (n, 3) [m] and velocities (n, 3) [m/s] in the same axes."""
     begin, end = _spans(time)
     step = (time[end] - time[begin])[:, None]
     return Motion((position[end] - position[begin]) / step, _integral(time, velocity, begin, end) / step)
 
 
 def turn(time: np.ndarray, quaternion: np.ndarray, rates: np.ndarray) -> Motion:
-    """That of attitudes (n, 4) and rates [rad/s] in the drone's axes."""
+    """`Motion` of attitudes (n, 4) and rates (n, 3) [rad/s] in the drone's axes."""
     begin, end = _spans(time)
     back = quaternion[begin] * np.array([1.0, -1.0, -1.0, -1.0])
     apart = np.asarray(rotations.multiply_quaternions(back, quaternion[end]))
@@ -91,7 +91,7 @@ def turn(time: np.ndarray, quaternion: np.ndarray, rates: np.ndarray) -> Motion:
 
 
 def _spans(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(begins, ends) of all spans of about `HORIZON` without a hole."""
+    """First and last rows of all spans of about `HORIZON` without a gap."""
     begin = np.arange(len(time))
     end = np.searchsorted(time, time + HORIZON)
     holes = np.concatenate([[0], np.cumsum(np.diff(time) > SILENCE)])
@@ -112,29 +112,29 @@ def _rms(rows: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Lag:
-    """By how much a signal is later than another, on a straight line between both ends of the recording."""
+    """Time by which a signal lags another one, linear in time from the beginning to the end of the recording."""
 
-    alike: float  # correlation of the whole, at one lag
-    begin: float  # [s] of the first signal's clock
+    alike: float  # correlation of the whole signals at one lag
+    begin: float  # [s] on the first signal's clock
     end: float
-    at_begin: float  # [s] by which the second is late
+    at_begin: float  # [s] lag of the second signal
     at_end: float
-    clear: bool  # windows agree with it
+    clear: bool  # whether it was found in at least one window
 
     @property
     def worst(self) -> float:
-        """The larger of both [s]."""
+        """The lag of larger magnitude [s]."""
         return max(self.at_begin, self.at_end, key=abs)
 
     def on_first_clock(self, time: np.ndarray) -> np.ndarray:
-        """`time` [s] of the second clock as the first has it."""
+        """`time` [s] on the second clock, converted to the first."""
         firsts = np.array([self.begin, self.end])
         slope = (self.at_end - self.at_begin) / (self.end - self.begin)
         return np.asarray(firsts[0] + (time - firsts[0] - self.at_begin) / (1 + slope))
 
 
 def lag(one: Samples, other: Samples, least: float, farthest: float = math.inf) -> Lag:
-    """How late `other` is against `one`, two signals (n, k) of which windows with an rms above `least` tell."""
+    """Lag of `other` against `one`, two signals (n, k); windows with an rms below `least` do not count."""
     (first, a), (second, b) = _band(one), _band(other)
     length = len(a) + len(b)
     products = np.fft.rfft(b, length, axis=0) * np.conj(np.fft.rfft(a, length, axis=0))
@@ -158,7 +158,7 @@ def lag(one: Samples, other: Samples, least: float, farthest: float = math.inf) 
 
 
 def _band(samples: Samples) -> tuple[float, np.ndarray]:
-    """(time of the first row, rows `GRID` apart) of what is neither noise nor a trend in `samples`."""
+    """(time of the first row, rows `GRID` apart) of `samples`, band-passed by two moving averages."""
     time, rows = samples
     grid = np.arange(time[0], time[-1], GRID)
     columns = np.stack([np.interp(grid, time, column) for column in rows.T], axis=1)
@@ -173,7 +173,7 @@ def _band(samples: Samples) -> tuple[float, np.ndarray]:
 
 
 def _window_lags(a: np.ndarray, b: np.ndarray, shift: int, least: float) -> list[tuple[float, float]]:
-    """(middle of a window from the first row on, lag) [s] where it is clear, near `shift` rows."""
+    """(middle of the window from the first row of `a`, lag) [s] of all `CLEAR` windows, searched about `shift` rows."""
     size, search, found = round(WINDOW / GRID), round(SEARCH / GRID), []
     for begin in range(max(0, search - shift), min(len(a), len(b) - shift - search) - size + 1, size // 4):
         mine = a[begin : begin + size]
@@ -193,10 +193,10 @@ def _window_lags(a: np.ndarray, b: np.ndarray, shift: int, least: float) -> list
 
 
 def faults(sent: Samples, recorded: Sequence[Samples]) -> list[str]:
-    """What is wrong with the clocks of leader and follower, a sentence each without a full stop.
+    """Faults of the clocks of leader and follower, as phrases for messages.
 
-    `sent` (T, 2, 4) are setpoints of a flight in the air, `recorded` the states (S, 13) of both drones, of which those
-    that come meanwhile count.
+    `sent` (T, 2, 4) are the setpoints of a flight in the air, `recorded` the states (S, 13) of both drones; those
+    outside the time of `sent` are ignored.
     """
     begin, end = sent[0][[0, -1]]
     within = [(time >= begin) & (time <= end) for time, _ in recorded]
@@ -207,7 +207,7 @@ def faults(sent: Samples, recorded: Sequence[Samples]) -> list[str]:
     leader, follower = ((time, rows[:, 10:13]) for time, rows in states)
     between = lag(leader, follower, TURNING, FARTHEST)
     if between.clear and abs(between.worst) > NEAR:
-        found.append(f"by their rates {_told('the follower', between, 'the leader')}")
+        found.append(f"by their rates {_offset_text('the follower', between, 'the leader')}")
     elif not between.clear and between.alike < ALIKE and min(_moving(leader), _moving(follower)) > MOVING:
         found.append(f"at best the two drones' rates agree by {between.alike:.2f}, and on one stick they are the same")
     elif text := _lift_fault(sent, states):
@@ -219,7 +219,7 @@ def _moving(samples: Samples) -> float:
     return _rms(_band(samples)[1])
 
 
-def _told(one: str, lag: Lag, other: str) -> str:
+def _offset_text(one: str, lag: Lag, other: str) -> str:
     what = f"{abs(lag.at_begin):.3f} s {'late' if lag.at_begin > 0 else 'early'}"
     if abs(lag.at_end - lag.at_begin) > 0.01:
         what += f" at first and {abs(lag.at_end):.3f} s {'late' if lag.at_end > 0 else 'early'} at last"
@@ -231,7 +231,7 @@ def _scale_fault(name: str, states: Samples) -> str:
     moved, turned = way(time, rows[:, :3], rows[:, 3:6]), turn(time, rows[:, 6:10], rows[:, 10:13])
     ratios = [one.ratio if one.size > MOVING else 1.0 for one in (moved, turned)]
     factors = np.log(ratios)
-    both = max(factors.min(), -factors.max())  # a clock changes them alike
+    both = max(factors.min(), -factors.max())  # a wrong clock scales both alike
     if both <= math.log(SCALE) and abs(factors).max() <= math.log(UNIT):
         return ""
     return (
@@ -241,9 +241,9 @@ def _scale_fault(name: str, states: Samples) -> str:
 
 
 def _lift_fault(sent: Samples, states: Sequence[Samples]) -> str:
-    """Whether the pair's vertical acceleration follows the thrust that both drones were sent.
+    """A message unless the pair's vertical acceleration follows the sent thrust with a plausible lag, else "".
 
-    Their mean is taken, which the stick's rotation does not change.
+    Both are means over the drones, which the stick's rotation does not change.
     """
     ticks, setpoints = sent
     grid = np.arange(
@@ -253,7 +253,7 @@ def _lift_fault(sent: Samples, states: Sequence[Samples]) -> str:
         return ""
     thrust = setpoints[np.searchsorted(ticks, grid, side="right") - 1, :, 3].mean(axis=1)
     climb = np.mean([np.interp(grid, time, rows[:, 5]) for time, rows in states], axis=0)
-    pushed = GRAVITY / max(float(thrust.mean()), 1.0) * thrust  # about what hovers
+    pushed = GRAVITY / max(float(thrust.mean()), 1.0) * thrust  # [m/s2], as if the mean thrust were that of hover
     found = lag((grid, pushed[:, None]), (grid, np.gradient(climb, grid)[:, None]), LIFTING, FARTHEST)
     middle, change = 0.5 * (found.at_begin + found.at_end), found.at_end - found.at_begin
     if not found.clear or (LIFT_LAGS[0] < middle < LIFT_LAGS[1] and abs(change) < LIFT_CHANGE):

@@ -1,8 +1,8 @@
-"""A flight log for other programs: MCAP with ROS 2 messages (Foxglove, PlotJuggler, `ros2 bag`), CSV and Parquet.
+"""Export of a flight log: MCAP with ROS 2 messages (Foxglove, PlotJuggler, `ros2 bag`), CSV and Parquet.
 
-MCAP holds every line of the log, and what streams as messages of ROS (`messages.TYPES`), stamped with the wall clock
-of the header if it has one. CSV and Parquet hold the flight as `recording.read_recording` reads it, a row per tick, SI
-units. As a program this module is what a `flight_log.Journal` writes an MCAP file with.
+MCAP holds every line of the log, and its data as ROS messages (`messages.TYPES`), stamped with the wall clock of the
+header if it has one. CSV and Parquet hold the flight as `recording.read_recording` reads it, a row per tick, SI units.
+`flight_log.Journal` runs this module as a process to write MCAP files.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from mjxfly.log_sources import HEADER, RECORD
 from mjxfly.messages import Encoder
 from mjxfly.recording import read_recording
 
-ABOUT = ("policy", "version", "config_hash", "mocap", "curve", "command")  # fields of the header, as metadata
-CHUNK_PERIOD = 0.25  # [s] between two chunks of an MCAP file that is recorded
+ABOUT = ("policy", "version", "config_hash", "mocap", "curve", "command")  # fields of the header, as MCAP metadata
+CHUNK_PERIOD = 0.25  # [s] between two chunks of an MCAP file while it is recorded
 
 
-class _Whole:
-    """A file of which what was written after the last `flush` is written anew by the next `commit`.
+class _CommittedFile:
+    """A file whose tail after the last `flush` is overwritten by the next `commit`.
 
-    A commit is one write, so that the file is as one of them left it, whenever the process is killed.
+    A commit is a single write, so that a killed process leaves a complete file.
     """
 
     def __init__(self, stream: BinaryIO):
@@ -66,7 +66,7 @@ class Recorder(Encoder):
 
     def __init__(self, stream: BinaryIO):
         """Write to `stream`, which can seek. Raises InputError without mcap-ros2-support."""
-        self._file = _Whole(stream)
+        self._file = _CommittedFile(stream)
         super().__init__(self._begun())
 
     def _begun(self) -> Any:
@@ -77,7 +77,7 @@ class Recorder(Encoder):
         return self._bag
 
     def take_line(self, line: bytes, record: Record) -> None:
-        """Write one `record`, the header first, and the `line` that holds it. Raises InputError: its clock is none."""
+        """Write one `record`, the header first, and its `line`. Raises InputError if its time cannot be stored."""
         self.take(record)
         if record["kind"] == "header":
             about = {name: str(record[name]) for name in ABOUT if name in record}
@@ -86,14 +86,14 @@ class Recorder(Encoder):
         self.write(f"/{name}", {"data": line.decode()}, self.time(record))
 
     def flush(self) -> None:
-        """End the chunk and write the index after it, where the next chunk will be: the file is whole."""
+        """End the chunk and write an index, which the next chunk overwrites: the file is complete."""
         self._bag.flush()
         self._bag.finish()
         self._file.commit()
 
 
 def write_mcap(path: Path, log: Path) -> list[str]:
-    """Write the flight log `log` as the MCAP file `path`; returns what a reader should know. Raises InputError."""
+    """Write the flight log `log` as the MCAP file `path`; return remarks on skipped lines. Raises InputError."""
     if is_foreign(log):
         raise InputError(f"{log} is not converted to .mcap; expected a flight log of JSON lines, .jsonl")
     remarks: list[str] = []
@@ -107,10 +107,10 @@ def write_mcap(path: Path, log: Path) -> list[str]:
 
 
 def record_lines(source: BinaryIO, target: BinaryIO) -> int:
-    """Write the lines of a flight log that come in the pipe `source` as an MCAP file until it ends.
+    """Write the lines of a flight log from the pipe `source` as an MCAP file to `target` until the pipe is closed.
 
-    Chunks are `CHUNK_PERIOD` apart, and the disk is synced as a `flight_log.Journal` does. Returns the exit code.
-    Raises InputError: these are no lines of a flight log.
+    Chunks are `CHUNK_PERIOD` apart, and the file is synced as by `flight_log.Journal`. Returns the exit code. Raises
+    InputError if these are no lines of a flight log.
     """
     recorder, tail = Recorder(target), flight_log.Tail(Path("standard input"), source)
     written = synced = time.monotonic()
@@ -131,7 +131,7 @@ def record_lines(source: BinaryIO, target: BinaryIO) -> int:
     return 0
 
 
-COLUMNS = {  # of CSV and Parquet, by the array of a `Recording`
+COLUMNS = {  # of CSV and Parquet, by field of `Recording`
     "goal": ("goal_x", "goal_y", "goal_z"),
     "position": ("x", "y", "z"),
     "velocity": ("vx", "vy", "vz"),
@@ -143,7 +143,7 @@ COLUMNS = {  # of CSV and Parquet, by the array of a `Recording`
 
 
 def table(log: Path) -> tuple[dict[str, Any], list[str]]:
-    """The flight in `log`, {column: (T,)}, and what a reader should know. Raises InputError."""
+    """The flight in `log` as {column: (T,)}, and remarks on its data. Raises InputError."""
     flight = read_recording(log)
     columns: dict[str, Any] = {"time": flight.time, "phase": list(flight.phase)}
     for name, heads in COLUMNS.items():
@@ -157,7 +157,7 @@ def table(log: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def write_csv(path: Path, log: Path) -> list[str]:
-    """Write the flight in `log` as CSV with a head; numbers that are not there are empty. Raises InputError."""
+    """Write the flight in `log` as CSV with a header row; missing values are empty. Raises InputError."""
     columns, remarks = table(log)
     stream = io.StringIO(newline="")
     writer = csv.writer(stream)
@@ -169,7 +169,7 @@ def write_csv(path: Path, log: Path) -> list[str]:
 
 
 def write_parquet(path: Path, log: Path) -> list[str]:
-    """Write the flight in `log` as Parquet; numbers that are not there are NaN. Raises InputError."""
+    """Write the flight in `log` as Parquet; missing values are NaN. Raises InputError."""
     import pyarrow
     import pyarrow.parquet
 
@@ -184,7 +184,7 @@ WRITERS = {".mcap": write_mcap, ".csv": write_csv, ".parquet": write_parquet}
 
 
 def main() -> int:
-    """Record what comes on standard input in the file that is standard output; the exit code."""
+    """Record log lines from standard input as MCAP to the file on standard output; return the exit code."""
     return cli.run_command(_record)
 
 

@@ -1,7 +1,7 @@
-"""A flight that another program recorded (`log_bags`, `log_cfclient`), as records of the flight log.
+"""Recordings of other programs (`log_bags`, `log_cfclient`) as records of the flight log.
 
-A bag of ours holds the log's own lines. Any other recording holds the states of two drones and the setpoints that they
-were sent; which rig flew, and with which gains, it does not say.
+Our own bags contain the lines of the log. Any other recording has the states of two drones and the setpoints sent to
+them, but neither the rig nor the gains.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from mjxfly.packets import DroneState
 from mjxfly.supervisor import State
 from mjxfly.telemetry import Rig
 
-UNKNOWN = "an unknown follower"  # name of the policy of a flight that another program recorded
-DIFFERENT = 0.5  # share of the drones' distance by which they may be elsewhere than the rig says
+UNKNOWN = "an unknown follower"  # policy name of a flight that another program recorded
+MAX_DEVIATION = 0.5  # largest deviation of the drones' relative position from the rig's, over its length
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether `path` is no file of JSON lines: a folder, a bag, or a CSV file."""
+    """Whether `path` is a folder, a bag or a CSV file, so not a file of JSON lines."""
     return path.is_dir() or path.suffix == ".csv" or is_bag(path)
 
 
 def read(path: Path, remark: Callable[[str], None], assumed: Config | None = None) -> bytes | list[Record]:
-    """The lines of a log of ours in the bag `path`, or records made of what another program recorded there.
+    """The lines of our own log in the bag `path`, or records made from another program's recording.
 
-    The rig, firmware and gains are those of `assumed`, by default the preset flight. `remark` is called with what a
-    reader should know. Raises InputError with one sentence that says what was found, and what was expected.
+    Rig, firmware and gains of the latter are those of `assumed`, by default the preset flight. `remark` is called with
+    notes on the data. Raises InputError with what was found and what was expected.
     """
     config = configs.preset("flight") if assumed is None else assumed
     if path.suffix == ".csv":
@@ -61,7 +61,7 @@ def read(path: Path, remark: Callable[[str], None], assumed: Config | None = Non
 
 
 def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
-    """Leader and follower, whose clocks are brought together by their rates, which are the stick's."""
+    """Leader and follower from cfclient's CSV files, on one clock: both drones have the stick's body rates."""
     pair = list(read_cfclient(path, remark).values())
     for number, (name, own) in enumerate(zip(NAMES, pair, strict=True)):
         lacking = [what for what in (*NEEDED, "rates") if what not in own]
@@ -82,7 +82,7 @@ def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
 
 
 def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -> list[Drone]:
-    """Leader and follower by their names, or by where on the stick they are."""
+    """Leader and follower from a bag, by their names, or by their places on the stick."""
     whole = {name: own for name, own in found.series.items() if own.keys() >= set(NEEDED)}
     if whole.keys() >= set(NAMES):
         whole = {name: whole[name] for name in NAMES}
@@ -99,10 +99,10 @@ def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -
     (one, first), (other, second) = whole.items()
     apart = _from_each_other(first, second)
     sides = [float(np.linalg.norm(sign * apart - rig.span)) for sign in (1.0, -1.0)]
-    if min(sides) > DIFFERENT * np.linalg.norm(rig.span):
+    if min(sides) > MAX_DEVIATION * np.linalg.norm(rig.span):
         raise InputError(
-            f"bag {path}: {one} is {_told(apart)} m from {other}; expected {_told(rig.span)}, as leader and follower "
-            "are on this rig: name another with --plant, or call the drones so"
+            f"bag {path}: {one} is {_vector_text(apart)} m from {other}; expected {_vector_text(rig.span)}, as leader "
+            "and follower are on this rig: name another with --plant, or call the drones so"
         )
     if sides[1] < sides[0]:
         one, first, other, second = other, second, one, first
@@ -110,19 +110,19 @@ def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -
     return [first, second]
 
 
-def _told(vector: np.ndarray) -> str:
+def _vector_text(vector: np.ndarray) -> str:
     return " ".join(f"{value:.2f}" for value in vector)
 
 
 def _from_each_other(first: Drone, second: Drone) -> np.ndarray:
-    """(3,) usual place of `first` from `second` in its own axes [m]."""
+    """(3,) median position of `first` relative to `second`, in the axes of `first` [m]."""
     time, position = first["position"]
     matrices = rotations.matrix_from_quaternion(attitude(time, first))
     return np.median(np.einsum("nji,nj->ni", matrices, position - at(time, second["position"])), axis=0)
 
 
 def _check_overlap(path: Path, pair: dict[str, Drone]) -> None:
-    """Raise InputError if there is no time at which all that is known of both drones was recorded."""
+    """Raise InputError if the series of both drones have no time in common; the battery does not count."""
     spans = {
         f"{called(quantity)} of {name}": (time[0], time[-1])
         for name, own in pair.items()
@@ -138,7 +138,7 @@ def _check_overlap(path: Path, pair: dict[str, Drone]) -> None:
 
 
 def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[float, DroneState]]:
-    """The states of one drone at the times of its positions."""
+    """(time, state) of one drone at the times of its positions, where all other quantities are known."""
     time, position = own["position"]
     quaternion = attitude(time, own)
     derived = []
@@ -161,19 +161,19 @@ def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[
         if (largest := float(np.abs(values).max())) > IMPOSSIBLE:
             raise InputError(f"the {name}'s {what} reaches {largest:.3g}, expected metres, m/s and rad/s")
     battery = at(time, own["battery"])[:, 0] if "battery" in own else np.full(len(time), np.nan)
-    told = np.logical_and.reduce(
+    complete = np.logical_and.reduce(
         [known(time, own[what][0]) for what in ("quaternion", "velocity", "along", "rates") if what in own]
     )
     rows = zip(position, velocity, quaternion, rates, battery, strict=True)
     return [
         (float(now), DroneState(*row[:4], 0, float(row[4])))
-        for now, row, sure in zip(time, rows, told, strict=True)
-        if sure
+        for now, row, is_known in zip(time, rows, complete, strict=True)
+        if is_known
     ]
 
 
 def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent: list[Samples]) -> list[Record]:
-    """A header, states, and a tick for each of the leader's setpoints once the follower has one; laws fly it all."""
+    """A header, states, and a tick for each setpoint of the leader once the follower has one, all in state FLY."""
     header = {"schema": SCHEMA, "policy": UNKNOWN, "config": config, "gains": pair_gains(config.autopilot)}
     found: list[Record] = []
     for name, own in zip(NAMES, states, strict=True):

@@ -1,4 +1,4 @@
-"""What the rows of a drone's recording hold: which are missing, and in which axes its velocities are."""
+"""Cleaning the series of a recorded drone: invalid rows are dropped, velocities and rates put into known axes."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from mjxfly.log_sources import Samples
 
 LONGEST = 4 * 3600.0  # [s] of a recording
 NEEDED = ("position", "quaternion", "sent")
-IMPOSSIBLE = 1e4  # of a position [m], a velocity [m/s], a rate [rad/s]
+IMPOSSIBLE = 1e4  # largest position [m], velocity [m/s] and rate [rad/s]
 EXPECTED = {
     "position": f"finite numbers up to {IMPOSSIBLE:g} m",
     "quaternion": "finite numbers and a length of 1",
     "sent": "finite numbers",
 }
-LEAP, LOST = (0.1, 10.0), 1.0  # [m], [m/s] beyond which a position is a leap; [s] for which a tracker may be elsewhere
-# What a pose's changes over those that are said tell of a unit: SI's in the other one's, and whose it is.
+LEAP, LOST = (0.1, 10.0), 1.0  # [m] + [m/s] times step that counts as a leap; [s] after which the pose must be back
+# Likely mistakes by the ratio of measured to recorded motion: ratio, quantity, unit that it may be in.
 UNITS = {
     "velocity": ((1000.0, "position", "mm"), (100.0, "position", "cm"), (0.001, "velocity", "mm/s")),
     "rates": ((math.pi / 180, "body rate", "deg/s"),),
 }
 AXES = ("the world's axes", "the drone's axes")
-USUAL = {"velocity": AXES[0], "along": AXES[1], "rates": AXES[1]}  # of quantities whose axes the poses tell
-WRONG = 0.7  # share of what moves by which what is said may be wrong; 0.2 to 0.4 in public flights (NanoBench)
+USUAL = {"velocity": AXES[0], "along": AXES[1], "rates": AXES[1]}  # usual axes of quantities that poses can verify
+MAX_ERROR = 0.7  # largest error of a recorded motion over the measured one; 0.2 to 0.4 in public flights (NanoBench)
 
 Drone = dict[str, Samples]  # by quantity
 
 
 def sound(path: Path, own: Drone, name: str, remark: Callable[[str], None]) -> Drone:
-    """The rows of `own` that are numbers at a time of their own; others are how most writers say "missing".
+    """The valid rows of every series of `own`; `remark` is called with notes on missing ones.
 
-    Velocities are in the world and rates in the drone's axes. Raises InputError if nothing is left of what is needed,
-    a series is too long, or velocities do not agree with the poses.
+    Velocities returned are in the world's axes, rates in the drone's. Raises InputError if a `NEEDED` series has fewer
+    than two valid rows, a series is too long, or velocities or rates do not agree with the poses.
     """
     found: Drone = {}
     missing: dict[str, list[str]] = {}
@@ -50,7 +50,7 @@ def sound(path: Path, own: Drone, name: str, remark: Callable[[str], None]) -> D
             if quantity in NEEDED:
                 has = f"{of_drone} has {len(time) - lost} good rows of {len(time)}"
                 raise InputError(f"{path}: {has}; expected two or more, of {EXPECTED[quantity]}")
-            continue  # as are those that nobody measured, which are zeros
+            continue  # all zeros: not measured
         if lost:
             where = f"{lost} of {len(time)} rows, first {time[~good][0] - time[0]:.2f} s after its beginning"
             missing.setdefault(where, []).append(called(quantity))
@@ -65,7 +65,7 @@ def sound(path: Path, own: Drone, name: str, remark: Callable[[str], None]) -> D
 
 
 def _sound_rows(quantity: str, time: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n,) which rows hold numbers that can be."""
+    """(n,) whether each row has finite values and a time within plausible bounds."""
     good = np.isfinite(rows).all(axis=1) & (np.abs(time - np.median(time)) <= LONGEST)
     if quantity != "sent":
         good &= (np.abs(rows) <= IMPOSSIBLE).all(axis=1)
@@ -73,12 +73,12 @@ def _sound_rows(quantity: str, time: np.ndarray, rows: np.ndarray) -> np.ndarray
         good[good] = np.abs(np.linalg.norm(rows[good], axis=1) - 1) <= UNEVEN
     if quantity == "position":
         kept = np.flatnonzero(good)
-        good[kept[_elsewhere(time[kept], rows[kept])]] = False
+        good[kept[_leaps(time[kept], rows[kept])]] = False
     return good
 
 
-def _elsewhere(time: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(n,) where a position leaps away and soon comes back, as that of a tracker that takes another body for it."""
+def _leaps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(n,) where a position leaps away and comes back within `LOST`, as if a tracker mistook another body for it."""
     away = np.zeros(len(time), bool)
 
     def far(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -94,10 +94,10 @@ def _elsewhere(time: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def _in_axes(path: Path, own: Drone, quantity: str, name: str, remark: Callable[[str], None]) -> Samples:
-    """The series `quantity`, velocities in the world or rates in the drone's axes, whichever axes it was written in.
+    """The series `quantity` with velocities in the world's or rates in the drone's axes, whichever it was recorded in.
 
-    They are those in which it agrees with the poses; where both do it does not matter, and they are the `USUAL` ones.
-    Raises InputError if it agrees in neither.
+    The recorded axes are those in which it agrees with the poses, the `USUAL` ones if it agrees in both. Raises
+    InputError if it agrees in neither.
     """
     time, rows = own[quantity]
     matrices = rotations.matrix_from_quaternion(attitude(time, own))
@@ -113,8 +113,8 @@ def _in_axes(path: Path, own: Drone, quantity: str, name: str, remark: Callable[
     other = next(one for one in AXES if one != usual)
     options = {axes: rows if (axes == AXES[1]) == (quantity == "rates") else turned for axes in AXES}
     motions = {axes: held(values) for axes, values in options.items()}
-    unit, least = ("rad/s", 0.05) if quantity == "rates" else ("m/s", 0.02)  # what tells no axes
-    most = max(2 * least, WRONG * motions[usual].size)
+    unit, least = ("rad/s", 0.05) if quantity == "rates" else ("m/s", 0.02)  # errors below `least` are noise
+    most = max(2 * least, MAX_ERROR * motions[usual].size)
     errors = {axes: f"{one.error:.2g} {unit}" for axes, one in motions.items()}
     if min(one.error for one in motions.values()) > most:
         ratios = [one.ratio for one in motions.values()]
@@ -134,12 +134,12 @@ def _in_axes(path: Path, own: Drone, quantity: str, name: str, remark: Callable[
 
 
 def at(time: np.ndarray, samples: Samples) -> np.ndarray:
-    """`samples` at `time` (n,), in between on a straight line."""
+    """(n, k) `samples` interpolated linearly to `time` (n,)."""
     return np.stack([np.interp(time, samples[0], column) for column in samples[1].T], axis=1)
 
 
 def attitude(time: np.ndarray, own: Drone) -> np.ndarray:
-    """(n, 4) unit quaternions at `time`."""
+    """(n, 4) unit quaternions interpolated to `time` (n,)."""
     when, rows = own["quaternion"]
     turns = np.cumprod([1.0, *np.where((rows[1:] * rows[:-1]).sum(axis=1) < 0, -1.0, 1.0)])
     found = at(time, (when, rows * turns[:, None]))
@@ -147,5 +147,5 @@ def attitude(time: np.ndarray, own: Drone) -> np.ndarray:
 
 
 def called(quantity: str) -> str:
-    """What a sentence calls it."""
+    """Name of a quantity in messages."""
     return {"sent": "setpoint", "along": "velocity", "rates": "body rate"}.get(quantity, quantity)

@@ -1,8 +1,7 @@
 """The schema of the flight log: every kind of record, its fields, their types and units.
 
-A new kind or field is one line of `KINDS`. Readers skip kinds that are not in it and hand on fields that are not, as
-JSON has them. `SCHEMA` is raised when an older reader would misread a record, not when kinds or optional fields are
-added.
+A new kind or field is one line of `KINDS`. Readers skip unknown kinds and pass on unknown fields as plain JSON.
+`SCHEMA` is raised when an older reader would misread a record, not when kinds or optional fields are added.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ Record = dict[str, Any]  # "t" [s], "kind", and the kind's fields, decoded
 
 
 class Type(NamedTuple):
-    """How a field is written, and what a reader makes of it."""
+    """JSON type of a field, and its decoder."""
 
     name: str
-    decode: Callable[[Any], Any]  # of the JSON value; raises ValueError or TypeError
+    decode: Callable[[Any], Any]  # from the JSON value; raises ValueError or TypeError
 
 
 class Field(NamedTuple):
     """One field of a kind of record."""
 
     type: Type
-    text: str = ""  # what it is, with its unit
+    text: str = ""  # description and unit
     required: bool = True
 
 
@@ -48,7 +47,7 @@ class Kind(NamedTuple):
 
 
 class StatePacket(NamedTuple):
-    """A drone's state as it came off the wire."""
+    """A drone's state as received."""
 
     stamp: int  # [ms] of the drone's clock, 24 bits
     state: packets.DroneState
@@ -75,7 +74,7 @@ def _state(value: Any) -> StatePacket:
 
 
 def array(*shape: int | None, finite: bool = True) -> Type:
-    """An array of `shape`, of which None may be any length; `finite` refuses inf and NaN."""
+    """Type of an array of `shape`, with None for any length; `finite` rejects inf and NaN."""
 
     def decode(value: Any) -> np.ndarray:
         found = np.array(value)
@@ -109,7 +108,7 @@ def record(text: str, /, **fields: Field) -> Kind:
 
 need, may = Field, functools.partial(Field, required=False)
 SETPOINTS = "leader's and follower's roll, pitch [deg], yaw rate [deg/s] and thrust [units] with the wire's signs"
-COMMAND = "roll, pitch [rad], vertical acceleration [m/s²] of its law, while it is in command"
+COMMAND = "roll, pitch [rad], vertical acceleration [m/s²] of its controller, while it is in command"
 KINDS: dict[str, Kind] = {
     "header": record(
         "first, once",
@@ -201,7 +200,7 @@ KINDS: dict[str, Kind] = {
         phase=need(TEXT, "idle, spin, ramp, fly, land, descend or stop"),
         cause=need(TEXT, "of the phase"),
         refusal=need(TEXT, "why it does not start, or good"),
-        copying=may(FLAG, "the copying law flies in the network's place"),
+        copying=may(FLAG, "the copying controller flies in the network's place"),
     ),
     "link": record("a link ends", drone=need(DRONE), text=need(TEXT, "why")),
     "warning": record("something else that does not end a flight", text=need(TEXT)),
@@ -212,7 +211,7 @@ KINDS: dict[str, Kind] = {
         cause=may(TEXT, "what ended the flight, if not its plan"),
         told=may(TEXTS, "why it ended and how the pair came down, a sentence each"),
         timing=may(JSON, "the loop's: ticks, missed deadlines, lateness (median, p99, largest) [s]"),
-        flown=may(JSON, "figures of the flight under both laws, see `mjxfly.figures`"),
+        flown=may(JSON, "figures of the flight under both controllers, see `mjxfly.figures`"),
         overwritten=may(array(None), "setpoints of each link that a newer one replaced"),
     ),
 }  # fmt: skip
@@ -221,7 +220,7 @@ KINDS: dict[str, Kind] = {
 def decode(raw: Mapping[str, Any]) -> Record | None:
     """The record of one JSON object with "t" and "kind"; None if its kind is not in the table.
 
-    Raises ValueError with half a sentence that names the field which is missing or not of its type.
+    Raises ValueError with a phrase that names the field which is missing or has the wrong type.
     """
     kind = KINDS.get(raw["kind"]) if isinstance(raw["kind"], str) else None
     if kind is None:

@@ -1,4 +1,4 @@
-"""What is taken of what other programs record of a flight: from which topic or log variable, in which unit and sign."""
+"""Topics and log variables that are read from recordings of other programs, with units and signs."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-HEADER, RECORD = "header", "record"  # last parts of the topics that hold the lines of a flight log of ours
-RADIAN = math.pi / 180  # of a degree
+HEADER, RECORD = "header", "record"  # last parts of the topics with the lines of our own flight log
+RADIAN = math.pi / 180  # [rad] per degree
 
 Samples = tuple[np.ndarray, np.ndarray]  # (n,) [s], (n, k)
 Series = dict[str, dict[str, Samples]]  # by drone and quantity
-Part = tuple[str, Any, dict[str, Any]]  # drone, "": the topic's; header or None; values by quantity
+Part = tuple[str, Any, dict[str, Any]]  # drone, "" for that in the topic's name; header or None; values by quantity
 WIDTHS = {"position": 3, "quaternion": 4, "velocity": 3, "along": 3, "rates": 3, "sent": 4, "battery": 1}
 
 
 class Topic(NamedTuple):
-    """What is taken from topics with one last part of their name, `/cf1/pose`; the part before it is the drone."""
+    """How to read topics by the last part of their name, as in `/cf1/pose`; the part before it is the drone."""
 
     type: str
     text: str
@@ -26,7 +26,7 @@ class Topic(NamedTuple):
 
 
 class Variable(NamedTuple):
-    """What a log variable of the firmware is: one number of a quantity, times `factor`."""
+    """A log variable of the firmware: times `factor` it is component `place` of a quantity."""
 
     quantity: str
     place: int

@@ -1,4 +1,4 @@
-"""What a bag unpacks to, bounded: the libraries that read it believe its sizes, and some kilobytes may be gigabytes."""
+"""Bounds on the decompressed size of a bag: the libraries trust its sizes, and kilobytes may expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -12,65 +12,66 @@ from typing import Any, BinaryIO
 
 from mjxball.errors import InputError
 
-TIMES, ALWAYS, DISK = 100, 16 * 2**20, 2**32  # of a bag's own size; [bytes] whatever its size; [bytes] of copies
-PACKED = b"\x28\xb5\x2f\xfd"  # with which what zstd compressed begins
-PIECE = 2**20  # [bytes] unpacked at once
-DEFINED = 2**20  # letters of the definitions of a bag's messages, of which the parser reads some 50 000 a second
+MAX_RATIO, MIN_LIMIT = 100, 16 * 2**20  # largest decompressed size over a bag's own; least such limit [bytes]
+MAX_COPIED = 2**32  # [bytes] of decompressed copies on disk
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # first bytes of zstd data
+CHUNK = 2**20  # [bytes] unpacked at once
+MAX_TEXT = 2**20  # largest size of all message definitions [characters]; the parser reads about 50 000 a second
 
 Unpack = Callable[[bytes], bytes]
 
 
 class Unpacking:
-    """Counts what the bag `path` of `size` bytes unpacks to, in all its chunks, messages and files."""
+    """Decompresses parts of the bag `path` of `size` bytes and bounds the total size of the results."""
 
     def __init__(self, path: Path, size: int):
-        self._path, self._limit = path, max(ALWAYS, TIMES * size)
+        self._path, self._limit = path, max(MIN_LIMIT, MAX_RATIO * size)
         self._left, self._copied, self._defined = self._limit, 0, 0
 
     def refuse(self) -> None:
-        """Raise InputError if it was too much, as whatever unpacks does at once."""
-        if self._left < 0 or self._copied > DISK:
-            most = min(self._limit, DISK) if self._copied > DISK else self._limit
+        """Raise InputError if a limit is exceeded. Every method that decompresses calls it."""
+        if self._left < 0 or self._copied > MAX_COPIED:
+            most = min(self._limit, MAX_COPIED) if self._copied > MAX_COPIED else self._limit
             raise InputError(
-                f"bag {self._path} unpacks to more than {most >> 20} MiB; expected at most {TIMES} times its own size, "
-                f"or {ALWAYS >> 20} MiB"
+                f"bag {self._path} unpacks to more than {most >> 20} MiB; expected at most {MAX_RATIO} times its own "
+                f"size, or {MIN_LIMIT >> 20} MiB"
             )
 
     def plain(self, data: bytes) -> bytes:
-        """`data`, counted."""
+        """`data`, which is counted against the limit."""
         self._left -= len(data)
         self.refuse()
         return data
 
     def zstd(self, data: bytes) -> bytes:
-        """What is in the frames `data`."""
+        """The decompressed frames `data`."""
         return b"".join(self._pieces(io.BytesIO(data)))
 
     def message(self, data: bytes) -> bytes:
-        """`data`, or what is in it if the recorder compressed it by itself, as no message in CDR begins."""
-        return self.zstd(data) if data[: len(PACKED)] == PACKED else data
+        """`data`, decompressed if the recorder compressed single messages; no CDR message begins like zstd data."""
+        return self.zstd(data) if data[: len(ZSTD_MAGIC)] == ZSTD_MAGIC else data
 
     def lz4(self, data: bytes) -> bytes:
-        """What is in the frame `data`. Raises ValueError if it is not whole."""
+        """The decompressed frame `data`. Raises ValueError if it is incomplete."""
         import lz4.frame
 
         frame, parts = lz4.frame.LZ4FrameDecompressor(), list[bytes]()
         while not frame.eof:
-            parts.append(self.plain(frame.decompress(data, max_length=PIECE)))
+            parts.append(self.plain(frame.decompress(data, max_length=CHUNK)))
             data = b""
             if frame.needs_input and not parts[-1]:
                 raise ValueError("a chunk is cut short")
         return b"".join(parts)
 
     def copy(self, source: Path, target: Path) -> None:
-        """Write what the file `source` was compressed from to the new file `target`."""
+        """Decompress the file `source` into the new file `target`."""
         with source.open("rb") as packed, target.open("xb") as stream:
             for piece in self._pieces(packed):
                 self._copied += stream.write(piece)
                 self.refuse()
 
     def records(self, stream: BinaryIO, size: int) -> Iterator[Any]:
-        """Records of the MCAP file `stream` of `size` bytes, and those in its chunks; what `mcap` raises."""
+        """Records of the MCAP file `stream` of `size` bytes, and those in its chunks. Raises what `mcap` raises."""
         from mcap.records import Chunk
         from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -83,9 +84,9 @@ class Unpacking:
 
     @contextlib.contextmanager
     def bounding(self) -> Iterator[None]:
-        """What rosbags unpacks and parses is counted meanwhile; it has no bounds of its own, nor a way to be told any.
+        """Make rosbags decompress and parse within the limits; it has no settings for that, so functions are replaced.
 
-        What a bag says of the quality of its connections is YAML that may grow without end, and is of no use here.
+        QoS profiles of a bag are not parsed: they are YAML, which may expand without bounds, and are not needed.
         """
         from rosbags.highlevel import anyreader
         from rosbags.rosbag2 import storage_mcap, storage_sqlite3
@@ -104,37 +105,37 @@ class Unpacking:
             yield
 
     def _defining(self, parse: Callable[..., Any]) -> Callable[..., Any]:
-        """`parse` of the definitions of messages, of which all together may have `DEFINED` letters."""
+        """`parse`, a parser of message definitions, limited to `MAX_TEXT` characters in total."""
 
         def counted(text: str, *given: Any) -> Any:
             self._defined += len(text)
-            if self._defined > DEFINED:
+            if self._defined > MAX_TEXT:
                 raise InputError(
-                    f"bag {self._path} defines its messages in more than {DEFINED >> 20} MiB; expected those of ROS 2"
+                    f"bag {self._path} defines its messages in more than {MAX_TEXT >> 20} MiB; expected those of ROS 2"
                 )
             return parse(text, *given)
 
         return counted
 
     def _by_name(self) -> dict[str, Unpack]:
-        """What unpacks a chunk, by the name of its compression."""
+        """Decompressors of chunks by name of the compression."""
         return {"": self.plain, "zstd": self.zstd, "lz4": self.lz4}
 
     def _pieces(self, packed: Any) -> Iterator[bytes]:
         import zstandard
 
         with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True, closefd=False) as stream:
-            while piece := stream.read(PIECE):
+            while piece := stream.read(CHUNK):
                 yield self.plain(piece)
 
 
 def _sized(unpack: Unpack) -> Callable[[bytes, int], bytes]:
-    """As rosbags calls it, with the size that a chunk says of itself."""
+    """`unpack` with the signature that rosbags expects; the stated size of the chunk is ignored."""
     return lambda data, _: unpack(data)
 
 
 def check_tables(path: Path) -> None:
-    """Raise InputError unless the SQLite file `path` holds tables of what is stored, and no recipes for more."""
+    """Raise InputError if the SQLite file `path` has views, virtual tables or generated columns, which may be huge."""
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as base:
         try:
             found = base.execute(

@@ -47,21 +47,21 @@ from mjxfly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, gi
 from mjxfly.uri import HERE, Udp, Uri, check_pair, parse_uri, share_dongle
 
 SLOW = ("slow", 1.0, clock.SLOWEST)
-# Numbers with least and most: of the battery, and of the rehearsal's link.
+# Flags with their bounds: battery, and the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
-WORSE = {  # once the motors turn: cflib connects over a good link only
+IMPAIRMENTS = {  # impairments of the link once the motors turn: cflib connects over a good link only
     "loss": "share of lost datagrams",
     "delay": "seconds that each is late",
     "jitter": "seconds more, at random",
 }
 
 
-# What `--help` leaves to `--help all`, besides all of the groups `twin` and `thrust`.
+# Flags that only `--help all` lists, besides those of the groups `twin` and `thrust`.
 RARE = {"--upload", "--mocap-rate", "--mocap-std", "--mocap-option"}
 
 
 def make_parser() -> cli.Parser:
-    """The flags; what None stands for is the policy card's."""
+    """The parser of the command line. A flag that is None has the value of the policy's configuration."""
     rare = set(RARE)
 
     def common(parser: cli.Parser, _: argparse.Namespace, topic: str | None) -> set[str] | None:
@@ -89,7 +89,7 @@ def make_parser() -> cli.Parser:
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
 
     add = parser.add_argument_group("the flight").add_argument
-    add("--seconds", type=float, default=20.0, metavar="S", help="time under both laws before landing (20)")
+    add("--seconds", type=float, default=20.0, metavar="S", help="time under both controllers before landing (20)")
     about = "of O from its start, m (0 0 0.4; a stand: 0 0 0.08)"
     add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
     add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
@@ -98,27 +98,27 @@ def make_parser() -> cli.Parser:
     about = "a live page of the log, for a browser on this machine (a free port)"
     add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
     add("--foxglove", type=int, metavar="PORT", help="--view: for Foxglove too, on this machine alone")
-    about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
+    about = "the controllers run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
     add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
     add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
 
     _add_mocap(parser.add_argument_group("motion capture"))
     thrust = parser.add_argument_group("thrust and firmware")
     add = thrust.add_argument
-    about = "JSON of firmware parameters to upload, for both drones or each, over the card's"
+    about = "JSON of firmware parameters to upload, for both drones or each, over the policy's"
     add("--gains", type=Path, metavar="FILE", help=about)
-    about = "m (g + az) through the force curve, or the paper's HOVER + 1000 az (the card's)"
+    about = "m (g + az) through the force curve, or the paper's HOVER + 1000 az (the policy's)"
     add("--thrust", choices=("calibrated", "paper"), help=about)
-    add("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
+    add("--hover", type=float, metavar="UNITS", help="--thrust paper: thrust at hover (the policy's)")
     add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
-    add("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
+    add("--mass", type=float, metavar="KG", help="--thrust calibrated: total mass (the policy's)")
 
     twin = parser.add_argument_group("faults and surroundings of the twin")
     kinds = ", ".join(FAULT_KINDS)
     about = f"--rehearse: after S seconds with motors on; may be repeated: {kinds}"
     twin.add_argument("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=about)
     for name, _, high in LINK[1:]:
-        about = f"--rehearse: {WORSE[name]}, up to {high:g}"
+        about = f"--rehearse: {IMPAIRMENTS[name]}, up to {high:g}"
         twin.add_argument(f"--{name}", type=float, metavar="X", help=about)
     add_twin_options(twin)
     rare.update(flag for group in (thrust, twin) for action in group._group_actions for flag in action.option_strings)
@@ -139,7 +139,7 @@ def _add_mocap(group: argparse._ArgumentGroup) -> None:
 
 
 def mocap_settings(options: argparse.Namespace, links: Sequence[Uri]) -> MocapSettings | None:
-    """What the flags ask for both drones' `links`, None without --mocap. Raises InputError for anything unsound."""
+    """Settings of motion capture for the drones at `links`, None without --mocap. Raises InputError."""
     if options.mocap is None:
         for name in ("mocap_host", "bodies", "mocap_rate", "mocap_std", "mocap_option"):
             if getattr(options, name):
@@ -153,7 +153,7 @@ def mocap_settings(options: argparse.Namespace, links: Sequence[Uri]) -> MocapSe
         raise InputError("--mocap needs --bodies LEADER FOLLOWER, the names of the two rigid bodies")
     if options.bodies[0] == options.bodies[1]:
         raise InputError("--bodies names one body for both drones")
-    # 400 packets a second would fill a dongle that both drones share.
+    # 400 packets a second would saturate a shared dongle.
     rate = options.mocap_rate or (50.0 if share_dongle(links) else 100.0)
     if not 50 <= rate <= 100:
         raise InputError(f"--mocap-rate must be 50 to 100, not {rate:g}")
@@ -170,7 +170,7 @@ def mocap_settings(options: argparse.Namespace, links: Sequence[Uri]) -> MocapSe
 
 
 def crazyflies(options: argparse.Namespace) -> CrazyswarmPair | None:
-    """The pair of --crazyflies, whose links and bodies `options` get. Raises InputError."""
+    """The pair of --crazyflies; its URIs and rigid bodies are entered in `options`. Raises InputError."""
     if options.crazyflies is None:
         return None
     if options.rehearse:
@@ -182,13 +182,13 @@ def crazyflies(options: argparse.Namespace) -> CrazyswarmPair | None:
 
 
 def parameters_of(options: argparse.Namespace, swarm: CrazyswarmPair | None) -> list[tuple[Path, PairGains]]:
-    """The files that firmware parameters come from, a later one's over an earlier one's. Raises InputError."""
+    """(file, its firmware parameters) in order of increasing precedence. Raises InputError."""
     found = [] if swarm is None else [(swarm.path, swarm.parameters)]
     return found + ([(options.gains, read_gains(options.gains))] if options.gains else [])
 
 
 def check_options(options: argparse.Namespace) -> list[Uri]:
-    """The drones' links, as far as they are given. Raises InputError for anything unsound."""
+    """The drones' links that are given by URI. Raises InputError for invalid flags."""
     if importlib.util.find_spec("cflib") is None:
         raise InputError("cflib is not installed; pip install 'mjxball[fly]'")
     links: list[Uri] = []
@@ -214,7 +214,7 @@ def check_options(options: argparse.Namespace) -> list[Uri]:
 
 
 def check_view(options: argparse.Namespace) -> None:
-    """Raise InputError for a live view that cannot be had."""
+    """Raise InputError if --view or --foxglove cannot be used."""
     if options.view is not None and ((options.rehearse and options.log is None) or not 0 <= options.view <= 65535):
         raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
     if options.foxglove is not None and (options.view is None or not 0 <= options.foxglove <= 65535):
@@ -222,7 +222,7 @@ def check_view(options: argparse.Namespace) -> None:
 
 
 def check_log(log: Path, viewed: bool) -> None:
-    """Raise InputError if the new file `log` cannot be written, or is to be `viewed` and cannot."""
+    """Raise InputError if the new file `log` cannot be written, or cannot be `viewed` live."""
     if log.exists():
         raise InputError(f"log file {log} exists; choose another name")
     if log.suffix not in (".jsonl", ".mcap"):
@@ -239,8 +239,8 @@ def check_log(log: Path, viewed: bool) -> None:
 
 
 def check_twin_options(options: argparse.Namespace) -> None:
-    """Raise InputError for options of a rehearsal that are unsound."""
-    own = [f"--{name}" for name in (*WORSE, "fault", "slow") if getattr(options, name)]
+    """Raise InputError for invalid flags of a rehearsal or of --onboard."""
+    own = [f"--{name}" for name in (*IMPAIRMENTS, "fault", "slow") if getattr(options, name)]
     given = [*own, *given_twin_options(options)]
     if given and not options.rehearse:
         raise InputError(f"{given[0]} is for --rehearse only")
@@ -260,7 +260,7 @@ def check_loaded(config: Config) -> None:
 
 
 def rehearsed_options(options: argparse.Namespace) -> list[str]:
-    """Which pair the twin is: ports, policy, apps."""
+    """The twin's flags that name the pair: ports, policy, apps."""
     ports = [uri.rsplit(":", 1)[1] if uri else "0" for uri in (options.leader, options.follower)]
     pair = ["--ports", *ports, "--policy", str(options.policy)]
     pair += ["--onboard", options.onboard] if options.onboard else []
@@ -268,17 +268,17 @@ def rehearsed_options(options: argparse.Namespace) -> list[str]:
 
 
 def twin_options(options: argparse.Namespace) -> list[str]:
-    """The twin's options: link, faults, drones, surroundings."""
-    worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
+    """The twin's flags for link, faults, drones and surroundings."""
+    worse = [f"--{name}={getattr(options, name)}" for name in IMPAIRMENTS if getattr(options, name) is not None]
     return [*worse, *(f"--fault={fault}" for fault in options.fault), *given_twin_options(options)]
 
 
 def on_board(
     options: argparse.Namespace, setup: FlightSetup, settings: FlightSettings
 ) -> tuple[FlightSetup, FlightSettings]:
-    """The flight for --onboard. Raises InputError for a policy that cannot fly there."""
+    """`setup` and `settings` for --onboard. Raises InputError for a policy that cannot run on board."""
     if options.thrust or options.hover or options.mass:
-        raise InputError("--onboard flies the thrust law in the app: leave --thrust, --hover and --mass out")
+        raise InputError("--onboard flies the thrust map in the app: leave --thrust, --hover and --mass out")
     policy, name = load_policy(options.policy), options.policy.stem
     generate.check_policy(policy, name)
     idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
@@ -289,7 +289,7 @@ def on_board(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly; exit code 0 if nothing went wrong, 1 after a fault, 2 on bad input."""
+    """Run the command line; return exit code 0 without faults, 1 after a fault, 2 on bad input."""
     options = make_parser().parse_args(arguments)
 
     def command() -> int:

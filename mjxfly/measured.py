@@ -1,8 +1,8 @@
-"""Whether what is measured of a drone goes on, and moves as the drone's own IMU says. Pure.
+"""Whether a drone's measurements keep changing, and move as its IMU says. Pure.
 
-A stream that stands still is found by its bits: no sensor says the same number for half a second. A stream in wrong
-axes or of a wrong scale, and an estimate that follows one that stands still, are found by what the IMU felt meanwhile:
-the gyroscope's turn against the measured one, twice the integral of the accelerometer against the measured way.
+A frozen stream is found by its bits: no sensor repeats a value for half a second. Poses in wrong axes or of a wrong
+scale, and an estimate that follows a frozen pose, are found by the IMU: the measured rotation is compared with the
+integrated gyroscope, the measured displacement with the accelerometer integrated twice.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from mjxball.control import rotations
 from mjxfly.packets import GRAVITY, Sensed
 from mjxfly.telemetry import Sample
 
-REPEATING = 0.5  # [s] for which a number may stay the same bit by bit
-SPARSE = 8  # times the mean time between two changes is allowed as well: poses at 10 Hz of which some are lost
-LIVE = 20  # changes after which a stream counts as one
-GAP = 0.1  # [s] between two packets, beyond which nothing is known of the time between
+REPEATING = 0.5  # [s] for which a value may stay bit-identical
+SPARSE = 8  # the same over the mean time between two changes, if that is longer: poses at 10 Hz with losses
+LIVE = 20  # changes after which a stream counts as live
+GAP = 0.1  # [s] between two packets that counts as a gap
 
 
 class Repeats:
-    """Which part of a stream stands still. `update` with every packet."""
+    """Finds frozen parts of a stream. `update` with every packet."""
 
     def __init__(self, names: Sequence[str]):
-        """`names` of the parts, each of which is to change by itself."""
+        """`names` of the parts, each of which must keep changing."""
         self._names = names
         self._last: list[Hashable] = [None] * len(names)
         self._since = [0.0] * len(names)  # [s] of the last change
@@ -36,16 +36,16 @@ class Repeats:
         self._before, self._changed, self._interval = math.nan, math.nan, 0.0  # [s]
 
     def stands(self, seconds: float) -> bool:
-        """True if no part of a live stream has changed for `seconds` by the newest packet."""
+        """True if no part of a live stream has changed in the `seconds` up to the newest packet."""
         return self.live and self._before - max(self._since) >= seconds - 1e-6
 
     @property
     def live(self) -> bool:
-        """True once the stream has changed often enough to be one."""
+        """True once every part has changed `LIVE` times."""
         return min(self._changes) >= LIVE
 
     def update(self, parts: Sequence[Hashable], now: float) -> str:
-        """The name of a part that has stood still for too long, empty if none; `now` [s] of the packet."""
+        """The name of a part that has been frozen for too long, empty if none; `now` [s] is the packet's time."""
         gap = now - self._before
         if gap > GAP:
             self._since = [since + gap for since in self._since]
@@ -64,40 +64,40 @@ class Repeats:
         return still[0] if still and self.live else ""
 
 
-WINDOW = 1.2  # [s] over which turns and ways are compared
-TURN = 0.035  # [rad] by which the measured turn may differ from the gyroscope's
-LATE = 0.04  # [s] that the measured attitude may be late against the gyroscope
-WAY, BIAS, DOUBT = 0.012, 0.1, 4.0  # likewise of the way, see `ImuWatch._felt`: [m], [m/s2], standard deviations
-CONTRADICTING = 0.1  # [s] for which it must differ
-TURNED, MOVED = math.radians(10), 0.1  # about and along an axis within the window, [m], which show that it is right
+WINDOW = 1.2  # [s] over which rotations and displacements are compared
+TURN = 0.035  # [rad] by which the measured rotation may differ from the gyroscope's
+LATE = 0.04  # [s] by which the measured attitude may lag the gyroscope
+SHIFT, BIAS, SIGMAS = 0.012, 0.1, 4.0  # tolerance of displacements [m], [m/s2], standard deviations: `ImuWatch._felt`
+CONTRADICTING = 0.1  # [s] for which they must differ
+TURNED, MOVED = math.radians(10), 0.1  # [rad] and [m] about and along an axis in the window that verify the axis
 
 
 class _Moment(NamedTuple):
-    """What is known at one packet."""
+    """Measured pose and IMU data at one packet."""
 
     time: float  # [s] of the firmware's clock
-    fresh: bool  # position and attitude are measured anew
+    fresh: bool  # the pose is a new measurement
     position: np.ndarray  # (3,) measured [m]
     quaternion: np.ndarray  # (4,) measured
-    turned: np.ndarray  # (4,) since the beginning, by the gyroscope
+    turned: np.ndarray  # (4,) rotation since the beginning, by the gyroscope
     rates: np.ndarray  # (3,) [rad/s]
     acceleration: np.ndarray  # (3,) in the world, by the accelerometer [m/s2]
 
 
 class ImuWatch:
-    """Holds one drone's measured motion against its IMU. `update` with every packet of what is sensed."""
+    """Compares one drone's measured motion with its IMU. `update` with every packet of sensed values."""
 
     def __init__(self, axes: Sequence[int] = (0, 1, 2), noise: float = 0.0):
-        """`axes` of the world along which the way counts; `noise` [m] of a position beyond motion capture's."""
-        self._axes, self._way = list(axes), WAY + DOUBT * math.sqrt(6) * noise  # of a second difference
+        """`axes` of the world that are compared; `noise` [m] of positions beyond that of motion capture."""
+        self._axes, self._tolerance = list(axes), SHIFT + SIGMAS * math.sqrt(6) * noise  # of a second difference
         self._moments: collections.deque[_Moment] = collections.deque()
         self._turned = np.array([1.0, 0.0, 0.0, 0.0])
         self._state: Sample | None = None
         self._wrong_since = math.inf
-        self._turned_by, self._moved_by = np.zeros(3), np.zeros(3)  # at most within a window, [rad] and [m]
+        self._turned_by, self._moved_by = np.zeros(3), np.zeros(3)  # largest within a window so far, [rad] and [m]
 
     def turn(self, sample: Sample) -> None:
-        """A state came: its rates [rad/s] turn the gyroscope's attitude on."""
+        """Integrate the rates of a new state into the gyroscope's attitude."""
         before, self._state = self._state, sample
         if before is None or sample.stamp == before.stamp:
             return
@@ -111,9 +111,9 @@ class ImuWatch:
     def update(
         self, time: float, force: Sequence[float], position: np.ndarray, quaternion: np.ndarray, fresh: bool = True
     ) -> str:
-        """What contradicts the IMU, empty if nothing: `force` (3,) [m/s2] at `time` [s] of the firmware's clock.
+        """How the measured motion contradicts the IMU, empty if it does not; `time` [s] of the firmware's clock.
 
-        `position` (3,) [m] and `quaternion` (4,) are what is measured; not `fresh`: what was measured before.
+        `force` (3,) [m/s2] is the accelerometer's; `position` (3,) [m] and `quaternion` (4,) repeat unless `fresh`.
         """
         if self._state is None or (self._moments and not 0 < time - self._moments[-1].time <= GAP):
             self._moments.clear()
@@ -135,12 +135,12 @@ class ImuWatch:
         return why if time - self._wrong_since >= CONTRADICTING else ""
 
     def not_shown(self) -> str:
-        """What was not seen to agree with the IMU yet, as an order to who carries the drone; empty if all was."""
+        """Instruction to move the drone by hand so that the remaining axes are verified; empty if all are."""
         turns = [name for name, angle in zip("xyz", self._turned_by, strict=True) if angle < TURNED]
         moves = [name for name, way in zip("xyz", self._moved_by, strict=True) if way < MOVED]
-        told = [f"turn it {math.degrees(TURNED):.0f} degrees about its {', '.join(turns)}"] if turns else []
-        told += [f"move it {MOVED:g} m along {', '.join(moves)}"] if moves else []
-        return " and ".join(told)
+        orders = [f"turn it {math.degrees(TURNED):.0f} degrees about its {', '.join(turns)}"] if turns else []
+        orders += [f"move it {MOVED:g} m along {', '.join(moves)}"] if moves else []
+        return " and ".join(orders)
 
     @staticmethod
     def _turn_fault(first: _Moment, last: _Moment) -> str:
@@ -154,7 +154,7 @@ class ImuWatch:
         return f"its attitude turned {math.degrees(angle):.1f} degrees otherwise than its gyroscope within {WINDOW:g} s"
 
     def _way_fault(self, known: Sequence[_Moment]) -> str:
-        """The second difference of the position against the accelerometer's, over the window and over its last half."""
+        """Compare the second difference of the position with the accelerometer's, over the window and its last half."""
         last = known[-1]
         for share in (0.5, 1.0):
             begin = next(one for one in known if last.time - one.time <= share * WINDOW)
@@ -171,30 +171,30 @@ class ImuWatch:
         return ""
 
     def _felt(self, begin: float, middle: float, end: float) -> tuple[np.ndarray, float]:
-        """(way (3,) from `begin` over `middle` to `end` [s] by the accelerometer, by how much it may be wrong) [m].
+        """(second difference of position (3,) by the accelerometer at three times [s], its tolerance) [m].
 
-        The limit is that of an accelerometer with a `BIAS` and the noise that it has in the window.
+        The tolerance allows for `BIAS` and for the accelerometer's noise in the window.
         """
         seen = [one for one in self._moments if one.time >= begin]
         times, felt = np.array([one.time for one in seen]), np.array([one.acceleration for one in seen])
-        # What an acceleration at each moment adds to that way [s]: it rises from the first to the middle, then falls.
+        # Weight of the acceleration at each moment [s]: it rises from the first time to the middle, then falls.
         ratio = (end - middle) / (middle - begin)
         share = np.where(times > middle, end - times, (times - begin) * ratio)[:, None]
         noise = math.sqrt(0.5 * float(np.square(np.diff(felt, axis=0)).sum(axis=1).mean()))
         step = (end - begin) / max(len(seen) - 1, 1)
         limit = (
-            self._way
+            self._tolerance
             + BIAS * float(share.sum()) * step
-            + DOUBT * noise * step * math.sqrt(float(np.square(share).sum()))
+            + SIGMAS * noise * step * math.sqrt(float(np.square(share).sum()))
         )
         return np.trapezoid(share * felt, times, axis=0), limit
 
 
 class DroneWatch:
-    """Everything of this module for one drone."""
+    """Finds frozen streams and contradictions to the IMU of one drone."""
 
     def __init__(self, axes: Sequence[int], noise: float = 0.0):
-        """`axes` of the world along which the drone can move; `noise` as of `ImuWatch`."""
+        """`axes` of the world along which the drone can move; `noise` [m] as in `ImuWatch`."""
         self._estimate = Repeats(("estimate", "gyroscope"))
         self._pose = Repeats(("x", "y", "z", "attitude"))
         self.imu = ImuWatch(axes, noise)
@@ -203,11 +203,11 @@ class DroneWatch:
         self._measured: Sequence[object] = ()  # pose in it
 
     def stands(self, seconds: float) -> bool:
-        """True if states have kept coming for `seconds`, and neither estimate nor gyroscope has changed."""
+        """True if neither estimate nor gyroscope has changed for `seconds` although states arrive."""
         return self._estimate.stands(seconds)
 
     def state(self, sample: Sample) -> str:
-        """What stands still in the drone's states, empty if nothing."""
+        """Message on a frozen part of the drone's states, empty if there is none."""
         if self._seen is not None and sample.stamp == self._seen.stamp:
             return ""
         self._seen = sample
@@ -218,7 +218,7 @@ class DroneWatch:
         return f"the numbers of its {still} stand still" if still else ""
 
     def sensed(self, sensed: Sensed, time: float) -> tuple[str, str]:
-        """(what stands still, what contradicts the IMU) in a packet of `time` [s] of the firmware's clock."""
+        """Messages (frozen pose, contradiction to the IMU), each empty if none; `time` [s] of the firmware's clock."""
         if self._seen is None or time <= self._sensed:
             return "", ""
         self._sensed, before = time, self._measured
@@ -226,18 +226,18 @@ class DroneWatch:
         fresh = self._measured != before
         still = self._pose.update((*sensed.position, sensed.quaternion), time)
         place, attitude = np.array(sensed.position), unit(sensed.quaternion)
-        if not self._pose.live:  # it measures by itself: what it makes of it must do
+        if not self._pose.live:  # no external poses, as with a positioning deck: use the estimate
             place, attitude = self._seen.state.position, self._seen.state.quaternion
         wrong = self.imu.update(time, sensed.force, place, attitude, fresh or not self._pose.live)
         return f"{still} of its measured pose stands still" if still else "", wrong
 
 
 def relative(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(4,) that turns `one` into `other`, about the body axes of `one`."""
+    """(4,) quaternion of the rotation from `one` to `other`, in the body axes of `one`."""
     return np.asarray(rotations.multiply_quaternions(one * np.array([1.0, -1.0, -1.0, -1.0]), other))
 
 
 def unit(quaternion: Sequence[float]) -> np.ndarray:
-    """A coarse `quaternion` (w, x, y, z) at unit length: its scalar part by the other three."""
+    """A coarse `quaternion` (w, x, y, z) at unit length, with w computed from x, y, z."""
     w, *vector = quaternion
     return np.array([math.copysign(math.sqrt(max(1.0 - sum(v * v for v in vector), 0.0)), w), *vector])

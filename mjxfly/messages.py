@@ -1,4 +1,4 @@
-"""A record of the flight log as messages of ROS 2: topics, types, and their definitions as a bag holds them."""
+"""Records of the flight log as ROS 2 messages: topics, types, and definitions as a bag stores them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mjxfly.log_schema import Record
 from mjxfly.packets import DroneState
 from mjxfly.telemetry import Rig, object_state
 
-WORLD, OBJECT = "world", "object"  # frames, beside one a drone
-LATEST = 2**31  # [s] since 1970, from which on a message cannot hold a time
+WORLD, OBJECT = "world", "object"  # frames, besides one for each drone
+LATEST = 2**31  # [s] since 1970: least time that a message cannot hold
 INFO, WARN, ERROR = 20, 30, 40  # levels of rcl_interfaces/msg/Log
 TEXTS = {
     "console": INFO,
@@ -61,7 +61,7 @@ FIELDS = {
     "float64[4] motors  # PWM 0 .. 65535\nfloat64 thrust  # of the setpoint in force, NaN: not told",
     "mjxball_msgs/Follower": "std_msgs/Header header\nfloat64[] observation\nfloat64[] hidden  # state of the GRU",
 }  # fmt: skip
-TYPES = {  # of the last part of a topic
+TYPES = {  # by the last part of a topic
     "tf": "tf2_msgs/TFMessage",
     "pose": "geometry_msgs/PoseStamped",
     "measured_pose": "geometry_msgs/PoseStamped",
@@ -81,7 +81,7 @@ Message = tuple[str, Any]  # topic, fields by name
 
 
 def definition(name: str) -> str:
-    """The message type `name`, "std_msgs/Header", with all that it is made of, as a ROS 2 bag holds it."""
+    """Definition of the message type `name`, such as "std_msgs/Header", with all nested types, as in a ROS 2 bag."""
     found: list[str] = []
 
     def visit(one: str) -> None:
@@ -97,19 +97,19 @@ def definition(name: str) -> str:
 
 
 class Encoder:
-    """Makes messages of the records of a flight log, and gives them to a sink."""
+    """Converts the records of a flight log to messages and writes them to a sink."""
 
     def __init__(self, sink: Any):
         """`sink` takes schemas, channels and messages as the writer of the package mcap does."""
         from mcap_ros2.writer import Writer
 
         self._writer = Writer(io.BytesIO())
-        self._writer._writer = sink  # its own is none that can be given
+        self._writer._writer = sink  # its constructor takes no sink
         self._schemas: dict[str, Any] = {}
         self._newest: dict[str, DroneState] = {}
 
     def take(self, record: Record) -> None:
-        """Write the messages of one `record`, the header first. Raises InputError: its clock is none."""
+        """Write the messages of one `record`, the header first. Raises InputError if its time cannot be stored."""
         if record["kind"] == "header":
             self._rig = Rig.of_plant(record["config"].plant)
             # Nanoseconds since 1970, or since the log's own clock began.
@@ -119,7 +119,7 @@ class Encoder:
             self.write(topic, fields, now)
 
     def time(self, record: Record) -> int:
-        """Of a record [ns]. Raises InputError if a message cannot hold it."""
+        """Time of a record [ns]. Raises InputError if a message cannot hold it."""
         seconds = record["t"] + self._shift
         if not 0 <= seconds < LATEST:
             raise InputError(f"the flight log's wall clock, {seconds:g} s, is none that a bag can hold")
@@ -134,15 +134,15 @@ class Encoder:
 
 
 def messages(record: Record, newest: dict[str, DroneState], rig: Rig, time: int) -> Iterator[Message]:
-    """What one record says, by topic; `newest` state of each drone, which a state replaces, `time` [ns]."""
+    """(topic, fields) of one record at `time` [ns]; a state also updates `newest`, the states by drone."""
     kind, drone = record["kind"], record.get("drone", "")
     if kind in KINDS:
         yield from KINDS[kind](record, drone, time)
     if kind in TEXTS:
-        told = [
+        parts = [
             value for name, value in record.items() if name in ("text", "told", "before", "after", "events", "cause")
         ]
-        text = "; ".join(", ".join(one) if isinstance(one, tuple) else one for one in told if one)
+        text = "; ".join(", ".join(one) if isinstance(one, tuple) else one for one in parts if one)
         log = {"stamp": _time(time), "level": TEXTS[kind], "name": drone or "mjxfly", "msg": f"{kind}: {text}"}
         yield "/rosout", {**log, "file": "", "function": "", "line": 0}
     if kind != "state":
@@ -179,11 +179,11 @@ def _of_tick(record: Record, drone: None, time: int) -> Iterator[Message]:
     yield "/phase", {"data": record["state"]}
     for name, sent in zip(NAMES, record["sent"], strict=True):
         header = _header(name, time)
-        numbers = dict(zip(("roll", "pitch", "yaw_rate", "thrust"), map(float, sent), strict=True))
-        yield f"/{name}/setpoint", {"header": header, **numbers}
+        setpoint = dict(zip(("roll", "pitch", "yaw_rate", "thrust"), map(float, sent), strict=True))
+        yield f"/{name}/setpoint", {"header": header, **setpoint}
         if name in record:
-            law = dict(zip(("roll", "pitch", "vertical_acceleration"), map(float, record[name]), strict=True))
-            yield f"/{name}/command", {"header": header, **law}
+            command = dict(zip(("roll", "pitch", "vertical_acceleration"), map(float, record[name]), strict=True))
+            yield f"/{name}/command", {"header": header, **command}
     if "observation" in record:
         hidden = record.get("hidden", np.zeros(0))
         own = {"observation": record["observation"].tolist(), "hidden": hidden.tolist()}
@@ -191,8 +191,8 @@ def _of_tick(record: Record, drone: None, time: int) -> Iterator[Message]:
 
 
 def _of_health(record: Record, drone: str, time: int) -> Iterator[Message]:
-    numbers = {"variance": record["variance"].tolist(), "motors": record["motors"].tolist()}
-    yield f"/{drone}/health", {"header": _header(drone, time), **numbers, "thrust": record["thrust"]}
+    health = {"variance": record["variance"].tolist(), "motors": record["motors"].tolist()}
+    yield f"/{drone}/health", {"header": _header(drone, time), **health, "thrust": record["thrust"]}
 
 
 def _of_pose(record: Record, drone: str, time: int) -> Iterator[Message]:
@@ -216,9 +216,9 @@ def _header(frame: str, time: int) -> dict[str, Any]:
     return {"stamp": _time(time), "frame_id": frame}
 
 
-def _vector(numbers: Any) -> dict[str, float]:
-    return dict(zip("xyz", map(float, numbers), strict=True))
+def _vector(components: Any) -> dict[str, float]:
+    return dict(zip("xyz", map(float, components), strict=True))
 
 
-def _quaternion(numbers: Any) -> dict[str, float]:
-    return dict(zip("wxyz", map(float, numbers), strict=True))
+def _quaternion(components: Any) -> dict[str, float]:
+    return dict(zip("wxyz", map(float, components), strict=True))

@@ -1,9 +1,9 @@
-"""Motion capture: poses of both drones' bodies, supervised and forwarded to the drones' estimators over our own links.
+"""Motion capture: poses of both drones' bodies are checked and forwarded to the drones' estimators over their links.
 
-How it is used: `ready(settings, span)` as a context manager, before anything is connected; `parameters` and then `feed`
-for each drone once its link is open; `checks` before flight; `guarding` when they passed; `faults` at every tick.
-Frames come from a child process that may hang or crash without hurting a flight; poses go out in the thread that reads
-it, not through the control loop.
+Usage: enter `ready(settings, span)` before connecting; write `parameters` and call `feed` for each drone once its link
+is open; run `checks` before flight and set `guarding` when they pass; call `faults` at every tick. A child process
+reads the frames, so that its hang or crash does not stop a flight. Poses are sent by the thread that reads the child,
+not by the control loop.
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ from mjxfly.process import wait_until
 from mjxfly.supervisor import Fault
 from mjxfly.telemetry import Note
 
-BUILT = ("vicon", "optitrack", "qualisys", "vrpn", "mock")  # what the package on PyPI was built with
+BUILT = ("vicon", "optitrack", "qualisys", "vrpn", "mock")  # kinds in the package on PyPI
 KINDS = (*BUILT, "optitrack_closed_source", "nokov", "motionanalysis", "fzmotion")
 LIMITS = MocapLimits()
 NOTE_PERIOD = 0.02  # [s] between two poses of a drone in the log
-KALMAN = 2  # of the firmware's parameter stabilizer.estimator
+KALMAN = 2  # value of the firmware's parameter stabilizer.estimator
 
 
 class MocapError(InputError):
-    """A motion capture system that cannot be had or flown on, in one sentence."""
+    """A motion capture system cannot be read or used for flight; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class MocapSettings:
-    """Which system, which bodies, and how their poses are used."""
+    """Motion capture system, rigid bodies, and rate and accuracy of the forwarded poses."""
 
     kind: str  # one of KINDS
     host: str = ""
     bodies: tuple[str, str] = ("leader", "follower")
     rate: float = 100.0  # of poses to each drone, at most [Hz]
     deviation: tuple[float, float] = (0.01, 0.05)  # standard deviations, position [m] and attitude [rad]
-    options: dict[str, str] = field(default_factory=dict)  # more of what the package takes for this kind
+    options: dict[str, str] = field(default_factory=dict)  # further arguments of the package for this kind
 
     def given(self) -> dict[str, str]:
-        """What the package is given. Raises MocapError for a host without an address."""
+        """Arguments for the package `motioncapture`. Raises MocapError for a host without an address."""
         host = self.host
-        if self.kind == "optitrack":  # the package takes numbers only
+        if self.kind == "optitrack":  # the package takes IP addresses only
             try:
                 host = socket.gethostbyname(host)
             except OSError:
@@ -70,15 +70,15 @@ class MocapSettings:
 
 
 class Source:
-    """The child process and the thread that reads it, in which `take` is called."""
+    """Reads frames from a child process in a thread, which calls `take`."""
 
     def __init__(self, settings: MocapSettings, take: Callable[[Frame], None]):
-        """Start both. Raises MocapError if the package is missing."""
+        """Start the process and the thread. Raises MocapError if the package is missing."""
         if importlib.util.find_spec("motioncapture") is None:
             raise MocapError("motioncapture is not installed; pip install 'mjxball[mocap]'")
         self._take = take
-        self.names: list[str] = []  # of all bodies that were seen
-        self.failure = ""  # why no more frames will come
+        self.names: list[str] = []  # of all bodies seen so far
+        self.failure = ""  # why reading has ended
         self._stopping = False
         arguments = [settings.kind, f"{settings.rate}", *settings.bodies, json.dumps(settings.given())]
         self._process = subprocess.Popen(
@@ -92,7 +92,7 @@ class Source:
         self._thread.start()
 
     def close(self) -> None:
-        """End the child and its thread."""
+        """Kill the child and end its thread."""
         self._stopping = True
         self._process.kill()  # it may be deep inside a call that never returns
         self._process.wait(timeout=5)
@@ -125,23 +125,23 @@ class Source:
 
 
 class Mocap:
-    """See the module. A context manager."""
+    """Checks and forwards the poses of both bodies, see the module. A context manager."""
 
     def __init__(self, settings: MocapSettings, span: np.ndarray, limits: MocapLimits = LIMITS):
-        """`span` (3,) [m] is leader from follower in body axes."""
+        """`span` (3,) [m] is the leader's position relative to the follower in body axes."""
         self.settings, self.limits = settings, limits
         self.tracks: Tracks = (Track(), Track())  # replaced as a whole, by the reader's thread alone
         self._span = span
         self._links: list[Link | None] = [None, None]
-        self.note: Note = lambda kind, t=None, **fields: None  # the log's, of gaps and of what is forwarded
+        self.note: Note = lambda kind, t=None, **fields: None  # logs gaps and forwarded poses
         self._halted = False
-        self.guarding = False  # a pose far from the drone's own estimate is not sent; before, the estimate follows it
+        self.guarding = False  # drop poses far from the drone's estimate, which must have converged to them before
         self._noted = [-math.inf, -math.inf]
         self._gap = [False, False]
         self._source: Source | None = None
 
     def __enter__(self) -> Mocap:
-        """Begin to read. Raises MocapError without the package."""
+        """Start reading. Raises MocapError if the package is missing."""
         self._source = Source(self.settings, self.take)
         return self
 
@@ -152,7 +152,7 @@ class Mocap:
     # Before the drones are connected.
 
     def wait_ready(self) -> None:
-        """Return once both bodies stand where they may be flown from. Raises MocapError, within about 6 s."""
+        """Wait until both bodies are seen and their poses fit a standing pair. Raises MocapError within about 6 s."""
         source, bounds, host = self._source, self.limits, self.settings.host
         assert source is not None
         where = f"the motion capture ({self.settings.kind}{' at ' + host if host else ''})"
@@ -172,7 +172,7 @@ class Mocap:
             raise MocapError(f"{where} cannot be flown on: {fault}")
 
     def _watch(self) -> str:
-        """Why the pair cannot be flown on what comes within `limits.measure`, empty if it can."""
+        """Fault of the poses of a standing pair within `limits.measure` seconds, empty if there is none."""
         before, bounds = self.tracks, self.limits
         clock.sleep(bounds.measure)
         both = list(zip(before, self.tracks, strict=True))
@@ -186,7 +186,7 @@ class Mocap:
     # Once a drone's link is open.
 
     def parameters(self) -> dict[str, float]:
-        """Parameters that each drone's firmware needs: Kalman estimator, deviations of poses."""
+        """Firmware parameters for each drone: Kalman estimator, standard deviations of the poses."""
         position, attitude = self.settings.deviation
         return {"stabilizer.estimator": KALMAN, "locSrv.extPosStdDev": position, "locSrv.extQuatStdDev": attitude}
 
@@ -195,7 +195,7 @@ class Mocap:
         self._links[number] = link
 
     def checks(self) -> list[Check]:
-        """What must hold of poses and estimates before the motors may turn; takes `limits.measure` seconds."""
+        """Preflight checks of poses and estimates; takes `limits.measure` seconds."""
         fault, now = self._watch(), clock.now()
         found = [Check("motion capture", not fault, fault or "both bodies in place")]
         for name, track, place in zip(NAMES, self.tracks, self._places(now), strict=True):
@@ -207,7 +207,7 @@ class Mocap:
     # In flight.
 
     def faults(self, now: float) -> list[Fault]:
-        """What is wrong with the poses at `now` [s]; never blocks."""
+        """Faults of the poses at `now` [s]; logs beginnings and ends of gaps. Never blocks."""
         tracks = self.tracks
         for number, track in enumerate(tracks):
             gap = track.age(now) > self.limits.age
@@ -218,11 +218,11 @@ class Mocap:
         return supervision.faults(tracks, now, self.limits)
 
     def halt(self) -> None:
-        """Send no more poses: they are in wrong axes, and without any an estimator knows its attitude for longer."""
+        """Stop forwarding poses that are in wrong axes: without them an estimator keeps its attitude for longer."""
         self._halted = True
 
     def take(self, frame: Frame, now: float | None = None) -> None:
-        """One frame, in the reader's thread: check it, send what is fit to be sent."""
+        """Check one frame and forward its valid poses, in the reader's thread."""
         before, now = self.tracks, clock.now() if now is None else now
         places = self._places(now) if self.guarding else (None, None)
         after = supervision.follow(before, frame, self.limits, self._span, places)
@@ -241,7 +241,7 @@ class Mocap:
             self.note("pose", drone=NAMES[number], age=age, position=where, quaternion=pose.quaternion)
 
     def _places(self, now: float) -> list[Sequence[float] | None]:
-        """Where each drone's estimator has it [m], None if that is not known or old."""
+        """Position of each drone by its own estimator (3,) [m], None if there is no recent one."""
         places: list[Sequence[float] | None] = []
         for link in self._links:
             newest = None if link is None else link.telemetry.newest
@@ -252,7 +252,7 @@ class Mocap:
 
 @contextlib.contextmanager
 def ready(settings: MocapSettings, span: np.ndarray, limits: MocapLimits = LIMITS) -> Iterator[Mocap]:
-    """A `Mocap` that may be flown on. Raises MocapError."""
+    """A `Mocap` after `wait_ready`. Raises MocapError."""
     with Mocap(settings, span, limits) as mocap:
         mocap.wait_ready()
         yield mocap

@@ -1,7 +1,7 @@
 """`python -m mjxfly.mocap_child`: reads a motion capture system and prints what it sees as lines of JSON.
 
-A process of its own, because the package `motioncapture` connects without a time limit and holds Python's lock
-meanwhile, waits without a limit for the next frame, and parses whatever the network sends in C++.
+It is a separate process because the package `motioncapture` connects without a time limit while it holds the GIL, waits
+for frames without a limit, and parses network data in C++.
 
 Lines: `{"error": TEXT}`; `{"names": [...]}` whenever a body is seen for the first time; `[LEADER, FOLLOWER]` at most
 RATE times a second, each null or [time, x, y, z, qw, qx, qy, qz] with the monotonic time of its frame [s].
@@ -23,25 +23,25 @@ from typing import Any
 from mjxball.cli import make_parser
 from mjxball.reading import parse_json
 
-CONNECT = 20.0  # [s] after which a connection that still blocks is given up, whatever became of the parent
+CONNECT = 20.0  # [s] after which a blocked connection is given up, even if the parent has ended
 
 
 class Decimation:
-    """Which of the frames go on, so that no more than `rate` a second do on the average."""
+    """Drops frames so that on average at most `rate` a second remain."""
 
     def __init__(self, rate: float):
         self._period, self._due = 1 / rate, -1e9
 
     def passes(self, now: float) -> bool:
-        """True if the frame of `now` [s] goes on."""
-        if now < self._due - self._period / 4:  # a system of the very same rate keeps all frames, for all their jitter
+        """True if the frame at `now` [s] is kept."""
+        if now < self._due - self._period / 4:  # tolerance: a system with the same rate keeps all frames despite jitter
             return False
         self._due = self._due + self._period if now - self._due < self._period else now + self._period
         return True
 
 
 class Merger:
-    """The newest pose of each wanted body since the last line; some systems send one body a frame."""
+    """Collects the newest pose of each wanted body between two lines: some systems send one body per frame."""
 
     def __init__(self, names: Sequence[str]):
         self._names = names
@@ -49,7 +49,7 @@ class Merger:
         self._newest: list[list[float] | None] = [None, None]
 
     def take(self, bodies: Any, now: float) -> list[str] | None:
-        """One frame, a mapping of names to rigid bodies; all names seen so far if there is a new one."""
+        """Add one frame, a mapping of names to rigid bodies; return all names so far if one is new, else None."""
         for number, name in enumerate(self._names):
             if name in bodies:
                 place, turn = bodies[name].position, bodies[name].rotation
@@ -65,13 +65,13 @@ class Merger:
         return any(self._newest)
 
     def line(self) -> list[list[float] | None]:
-        """What came since the last call."""
+        """Pose of each wanted body, [time, x, y, z, qw, qx, qy, qz] or None, since the last call."""
         newest, self._newest = self._newest, [None, None]
         return newest
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print frames until standard input ends."""
+    """Print frames until standard input ends; return the exit code."""
     parser = make_parser("python -m mjxfly.mocap_child", "Read motion capture; started by mjxfly.")
     parser.add_argument("kind")
     parser.add_argument("rate", type=float)
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str]) -> int:
             _read(options, say)
         except BrokenPipeError:
             raise
-        except Exception as error:  # whatever C++ throws; the parent makes a sentence of it
+        except Exception as error:  # whatever C++ throws; the parent reports it
             text = str(error).strip() or type(error).__name__
             say({"error": text.splitlines()[0]})
     return 0
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _read(options: Any, say: Any) -> None:
     package = importlib.import_module("motioncapture")
-    with contextlib.suppress(AttributeError, ValueError):  # the kernel needs no lock of Python's to end us
+    with contextlib.suppress(AttributeError, ValueError):  # the kernel can end us while the GIL is held
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, CONNECT)
     system = package.connect(options.kind, options.settings)
@@ -113,7 +113,7 @@ def _read(options: Any, say: Any) -> None:
         names = merger.take(system.rigidBodies, now)
         if names is not None:
             say({"names": names})
-        if merger.waits and decimation.passes(now):  # VRPN's client returns twice as often as it has anything
+        if merger.waits and decimation.passes(now):  # VRPN's client returns twice per frame
             say(merger.line())
 
 

@@ -1,7 +1,7 @@
-"""Which poses of a motion capture system may be sent to the drones, and when there are too few of them. Pure.
+"""Validity of the poses of a motion capture system, and when valid ones are missing for too long. Pure.
 
-A pose that is not fit to be sent is dropped and the estimator coasts on its IMU; what ends a flight is the age of the
-last one that was fit. So one bad frame costs nothing, and no wrong pose ever reaches a drone that flies.
+An invalid pose is dropped, and the estimator coasts on its IMU. The age of the last valid pose ends a flight. One bad
+frame therefore has no effect, and no wrong pose reaches a flying drone.
 """
 
 from __future__ import annotations
@@ -23,62 +23,62 @@ from mjxfly.supervisor import Event, Fault
 class MocapLimits:
     """Bounds on poses, before and in flight."""
 
-    answer: float = 5.0  # from the start until any body was seen [s]
-    appear: float = 1.0  # from then until both of the drones' were [s]
+    answer: float = 5.0  # from the start until any body is seen [s]
+    appear: float = 1.0  # from then until both drones' bodies are seen [s]
     measure: float = 0.5  # time over which the bodies are watched before the drones are connected [s]
-    rate: float = 45.0  # least rate of both bodies [Hz]: 50 less what jitter takes from half a second
-    age: float = 0.1  # a gap in the poses that goes into the log, and makes a pose unfit for comparisons [s]
-    lost: float = 0.3  # a gap that ends the flight: until then the estimator coasts [s]
-    frozen: float = 0.2  # of bit-identical poses, which no camera sees twice [s]
-    still: float = 0.2  # of one bit-identical coordinate beside others that change [s]
-    length_error: float = 0.03  # of the distance between bodies that stand: 1.1 times that of a rig of 0.3 m [m]
+    rate: float = 45.0  # least rate of both bodies [Hz]: 50 with a margin for jitter in half a second
+    age: float = 0.1  # gap in the poses that is logged, and age of a pose too old to compare [s]
+    lost: float = 0.3  # gap that ends the flight: until then the estimator coasts [s]
+    frozen: float = 0.2  # of bit-identical poses, which no camera measures twice [s]
+    still: float = 0.2  # of one bit-identical coordinate while others change [s]
+    length_error: float = 0.03  # of the distance between standing bodies [m]: 10 % of a rig of 0.3 m
     speed: float = 5.0  # between two frames [m/s]
-    jitter: float = 0.02  # that is allowed beside the speed [m]
-    longest_step: float = 0.1  # time for which the speed counts after a gap, at most [s]
+    jitter: float = 0.02  # allowed in addition to `speed` times step [m]
+    longest_step: float = 0.1  # longest step in that product, after a gap [s]
     disagreement: float = 0.15  # of a pose from the drone's own estimate [m]
-    apart: float = 0.05  # bodies that are closer are one body [m]
+    apart: float = 0.05  # bodies that are closer count as one body [m]
     rig_error: float = 0.1  # of the line between the bodies against the rig [m]
-    tilt: float = math.radians(8)  # of a body that stands before flight [rad]
-    yaw: float = math.radians(15)  # from the world's x axis, likewise [rad]
-    farthest: float = 100.0  # from the origin, beyond which the firmware's estimator gives up [m]
+    tilt: float = math.radians(8)  # of a standing body before flight [rad]
+    yaw: float = math.radians(15)  # of the same from the world's x axis [rad]
+    farthest: float = 100.0  # coordinate, beyond which the firmware's estimator resets [m]
 
 
 class Pose(NamedTuple):
-    """Where one body was seen."""
+    """Measured pose of one body."""
 
     time: float  # of arrival on the monotonic clock [s]
     position: tuple[float, float, float]  # in the world [m]
     quaternion: tuple[float, float, float, float]  # body -> world (w, x, y, z), unit length
 
 
-Frame = tuple[Pose | None, Pose | None]  # leader and follower; None: not seen, or not numbers
+Frame = tuple[Pose | None, Pose | None]  # leader and follower; None: not seen, or not finite
 
 
 @dataclass(frozen=True)
 class Track:
-    """What is known of one body's poses."""
+    """Newest poses of one body and their validity."""
 
-    last: Pose | None = None  # newest that came
-    good: Pose | None = None  # newest that was fit to be sent
-    reason: str = "it was never seen"  # why none has been fit since
-    changed: tuple[float, ...] = (-math.inf,) * 3  # when each coordinate was another one the last time [s]
+    last: Pose | None = None  # newest pose
+    good: Pose | None = None  # newest valid pose
+    reason: str = "it was never seen"  # why the newest pose is invalid, empty if it is valid
+    changed: tuple[float, ...] = (-math.inf,) * 3  # time of the last change of each coordinate [s]
     received: int = 0
     jumps: int = 0
 
     def age(self, now: float) -> float:
-        """Of the newest fit pose at `now` [s]."""
+        """Age of the newest valid pose at `now` [s]."""
         return math.inf if self.good is None else now - self.good.time
 
 
 Tracks = tuple[Track, Track]
-Places = Sequence[Sequence[float] | None]  # where each drone's own estimator has it [m], None: unknown
+Places = Sequence[Sequence[float] | None]  # position of each drone by its own estimator [m], None: unknown
 
 
-def pose_of(time: float, numbers: Sequence[float], limits: MocapLimits = MocapLimits()) -> Pose | None:
-    """A pose of x, y, z, qw, qx, qy, qz with its quaternion at unit length; None if they cannot be one."""
-    if len(numbers) != 7 or not all(map(math.isfinite, numbers)):
+def pose_of(time: float, values: Sequence[float], limits: MocapLimits = MocapLimits()) -> Pose | None:
+    """Pose from x, y, z, qw, qx, qy, qz, its quaternion normalised, w >= 0; None if the values are no pose."""
+    if len(values) != 7 or not all(map(math.isfinite, values)):
         return None
-    x, y, z, *quaternion = map(float, numbers)
+    x, y, z, *quaternion = map(float, values)
     length = math.sqrt(sum(part * part for part in quaternion))
     if abs(length - 1) > 0.05 or max(abs(x), abs(y), abs(z)) > limits.farthest:
         return None
@@ -90,13 +90,13 @@ def pose_of(time: float, numbers: Sequence[float], limits: MocapLimits = MocapLi
 def follow(
     tracks: Tracks, frame: Frame, limits: MocapLimits, span: np.ndarray, places: Places = (None, None)
 ) -> Tracks:
-    """The tracks after one more `frame`; `span` (3,) [m] is leader from follower in body axes.
+    """The tracks after one more `frame`; `span` (3,) [m] is the leader relative to the follower in body axes.
 
-    A track's `good` is replaced only by a pose that is fit to be sent.
+    A track's `good` is replaced only by a valid pose.
     """
     after = [_follow_one(track, pose, limits, place) for track, pose, place in zip(tracks, frame, places, strict=True)]
     wrong = pair_fault((after[0], after[1]), limits, span)
-    if wrong and not any(track.reason for track in after):  # else one of them is known to be the wrong one
+    if wrong and not any(track.reason for track in after):  # else it is known which one is wrong
         after = [dataclasses.replace(new, good=old.good, reason=wrong) for old, new in zip(tracks, after, strict=True)]
     return after[0], after[1]
 
@@ -130,7 +130,7 @@ FROZEN = "its numbers stand still"
 
 
 def pair_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
-    """What contradicts the rig in the newest poses of both bodies, empty if nothing or if they cannot be compared."""
+    """How the newest poses of both bodies contradict the rig, empty if they do not or cannot be compared."""
     one, other = tracks[0].last, tracks[1].last
     if one is None or other is None or abs(one.time - other.time) > limits.age:
         return ""
@@ -149,7 +149,7 @@ def pair_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
 
 
 def scale_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
-    """Why two bodies that stand cannot be as far from each other as they are, empty if they can."""
+    """Message if the distance of two standing bodies does not fit the rig, else empty."""
     one, other = tracks[0].last, tracks[1].last
     if one is None or other is None:
         return ""
@@ -163,7 +163,7 @@ def scale_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
 
 
 def faults(tracks: Tracks, now: float, limits: MocapLimits = MocapLimits()) -> list[Fault]:
-    """A body without a fit pose for too long at `now` [s]."""
+    """Faults at `now` [s]: bodies without a valid pose for too long."""
     found = []
     for name, track in zip(NAMES, tracks, strict=True):
         age = track.age(now)
@@ -175,7 +175,7 @@ def faults(tracks: Tracks, now: float, limits: MocapLimits = MocapLimits()) -> l
 
 
 def standing_fault(tracks: Tracks, now: float, limits: MocapLimits, span: np.ndarray) -> str:
-    """Why a pair that stands on the ground may not be flown on these poses at `now` [s], empty if it may."""
+    """Why the poses of a pair that stands on the ground are not fit for flight at `now` [s], empty if they are."""
     wrong = pair_fault(tracks, limits, span) or scale_fault(tracks, limits, span)
     if wrong:
         return wrong
@@ -195,7 +195,7 @@ def standing_fault(tracks: Tracks, now: float, limits: MocapLimits, span: np.nda
 
 
 def posture_fault(pose: Pose, limits: MocapLimits) -> str:
-    """Why a body that stands level and points along +x cannot have this `pose`, empty if it can."""
+    """How `pose` differs from that of a body that stands level and points along +x, empty if it does not."""
     roll, pitch, yaw = rotations.euler_from_matrix(rotations.matrix_from_quaternion(np.array(pose.quaternion)))
     tilt = math.acos(min(max(math.cos(roll) * math.cos(pitch), -1.0), 1.0))
     if tilt > limits.tilt:

@@ -1,7 +1,7 @@
-"""What is wrong with drones and estimates in flight: single states, and what shows over time only. Pure.
+"""Faults of drones and estimates in flight, in single states and over time. Pure.
 
-The estimators run on the drones. One whose poses stop, freeze or jump goes on reporting; it shows in the variance, in a
-step that its own velocity does not explain, or against the other drone, which sits on the same stick.
+The estimators run on the drones. One whose poses stop, freeze or jump keeps reporting. The fault shows in its variance,
+in a step that its velocity does not explain, or in a contradiction to the other drone on the same stick.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from mjxfly.packets import DroneState, Health
 from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State
 from mjxfly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
-# From where on an estimator is not believed, and a drone counts as not hearing.
+# Thresholds at which an estimator is not trusted, or a drone counts as not hearing.
 JUMP = 0.08  # of the position, beyond what its velocity explains [m]
-JUMP_TIME = 0.1  # between two states, beyond which nothing is said about a jump [s]
-HEIGHT, CLIMB = 0.05, 0.3  # of one drone against the other one and the roll [m, m/s]
-LASTING = 0.25  # [s] that heights or climbs must disagree
-APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and in standard deviations of the filters
-USUAL = 10.0  # [s] of that mean
+JUMP_TIME = 0.1  # longest step between two states that is checked for a jump [s]
+HEIGHT, CLIMB = 0.05, 0.3  # difference between both drones' heights [m] and climbs [m/s], corrected for the attitude
+LASTING = 0.25  # [s] for which heights or climbs must disagree
+APART, SIGMAS = 0.015, 4.0  # change of their relative position along an axis: [m], and in standard deviations
+USUAL = 10.0  # [s] time constant of the mean that this change is measured from
 LIMITS = Limits()
-ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
-RECENT = 0.1  # [s] of what was sent, against which a thrust in force that stands still is held
-SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
-CLOSED = (State.RAMP, *GUIDED)  # what is measured decides on the thrust; before, a pair at rest may be quiet
-# [s] after these in which the other stream may stand still of the same cause. Later, one that is wrong still leads down
-# better than none: the blind way would begin in its middle.
+ECHO = 0.3  # [s] within which a sent thrust is reported back as the one in force
+RECENT = 0.1  # [s] of sent thrusts with which a constant thrust in force is compared
+ROUNDING = 1.5  # [thrust units] rounding tolerance between two equal thrusts
+CLOSED = (State.RAMP, *GUIDED)  # the thrust depends on the estimates; before, the streams of a pair at rest may freeze
+# [s] after CLOSED in which a stream may freeze by the same cause. Later a frozen estimate still steers a descent better
+# than none, since the blind descent would start in its middle.
 TOGETHER = 0.1
-FROZEN = 0.1  # [s] of states that come and do not change, from which on a drone that does not hear does nothing at all
-RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
-UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
+FROZEN = 0.1  # [s] without change of its states after which a drone that does not hear counts as frozen
+RISING = (State.RAMP, State.FLY)  # contact with the ground causes accelerations that the packets do not resolve
+UNHEARD = 4  # consecutive health packets without an echo, or with a constant one
 
 
 class Sustained:
@@ -48,7 +48,7 @@ class Sustained:
         self.seconds, self._since = seconds, math.inf
 
     def update(self, holds: bool, now: float) -> bool:
-        """Tell it whether the condition `holds` at `now` [s]."""
+        """Add whether the condition `holds` at `now` [s]; return whether it has lasted."""
         self._since = min(self._since, now) if holds else math.inf
         return now - self._since >= self.seconds
 
@@ -59,7 +59,7 @@ def tilt_angle(quaternion: np.ndarray) -> float:
 
 
 def down_reason(info: int, armed: bool = True) -> str:
-    """Why the firmware will not fly, empty if it will; one that is not armed yet need not be able to."""
+    """Why the firmware will not fly, by its `info` bits, empty if it will; CAN_FLY counts only if it is `armed`."""
     for bit, reason in ((packets.LOCKED, "is locked"), (packets.CRASHED, "crashed"), (packets.TUMBLED, "tumbled")):
         if info & bit:
             return reason
@@ -67,7 +67,7 @@ def down_reason(info: int, armed: bool = True) -> str:
 
 
 def stick_faults(states: Sequence[DroneState], span: np.ndarray, limits: Limits) -> list[Fault]:
-    """The line between the two reported positions against the stick that joins them, `span` (3,) [m]."""
+    """Faults of length and tilt of the line between both reported positions; the stick is `span` (3,) [m]."""
     line = states[0].position - states[1].position
     length, known = math.sqrt(float(line @ line)), math.sqrt(float(span @ span))
     if abs(length - known) > limits.stick_error:
@@ -79,7 +79,7 @@ def stick_faults(states: Sequence[DroneState], span: np.ndarray, limits: Limits)
 
 
 def link_faults(links: Sequence[DroneLink], ages: Sequence[float], limits: Limits, now: float) -> list[Fault]:
-    """Links that have ended or take nothing, and states older than allowed; `ages` (2,) [s] by the worse clock."""
+    """Links that have ended or cannot send, and states that are too old; `ages` (2,) [s] by the worse clock."""
     faults = []
     for name, link in zip(NAMES, links, strict=True):
         if link.lost:
@@ -91,27 +91,27 @@ def link_faults(links: Sequence[DroneLink], ages: Sequence[float], limits: Limit
 
 
 class Monitor:
-    """Checks both drones. `update` once a tick."""
+    """Checks both drones' states, estimates and uplinks. `update` once a tick."""
 
     def __init__(self, rig: Rig, settings: FlightSettings):
         self._rig, self._settings = rig, settings
         bounds = settings.limits
-        self._held = dataclasses.replace(bounds, tilt=min(bounds.hold_tilt, bounds.tilt))
+        self._hold_limits = dataclasses.replace(bounds, tilt=min(bounds.hold_tilt, bounds.tilt))
         self._low = [Sustained(bounds.battery_time) for _ in NAMES]
         self.origin = np.zeros(3)  # where O stood at the start [m]
         self.estimators = EstimatorWatch(rig, not settings.stand, bounds)
         axes = (2,) if settings.stand else (0, 1, 2)
         self._drones = [DroneWatch(axes, bounds.noise) for _ in NAMES]
         self.uplinks = [UplinkWatch(name) for name in NAMES]
-        self.object: ObjectState | None = None  # newest that can be trusted
-        self._closed = -math.inf  # [s] when what is measured last decided on the thrust
+        self.object: ObjectState | None = None  # newest trusted state
+        self._closed_at = -math.inf  # [s] last time in a state of `CLOSED`
 
     def update(self, phase: State, links: Sequence[DroneLink], ages: Sequence[float], now: float) -> list[Fault]:
-        """What is wrong in the supervisor's state `phase` at `now` [s]; `ages` (2,) [s] are the states'."""
+        """Faults in the supervisor's state `phase` at `now` [s]; `ages` (2,) [s] are those of the states."""
         samples = [link.telemetry.newest for link in links if link.telemetry.newest is not None]
         healths = [link.telemetry.health for link in links]
         fresh = [age <= self._settings.limits.state_age for age in ages]
-        self._closed = now if phase in CLOSED else self._closed
+        self._closed_at = now if phase in CLOSED else self._closed_at
         dry, faults = self._settings.dry_run, self._measured(phase, links, now)
         if phase in AIRBORNE and all(fresh):
             faults += self.estimators.update(samples, [one and one.health for one in healths], now)
@@ -120,7 +120,7 @@ class Monitor:
                 found = watch.update(*health) if health is not None else []
                 faults += [watch.frozen] if found and drone.stands(FROZEN) else found
         self.object = self.estimators.object(samples, fresh) or self.object
-        bounds = self._held if phase is State.HOLD else self._settings.limits
+        bounds = self._hold_limits if phase is State.HOLD else self._settings.limits
         states = [sample.state for sample in samples]
         for name, state, known in zip(NAMES, states, fresh, strict=True):
             faults += self._from_state(name, state, bounds, phase not in ON_GROUND and not dry) if known else []
@@ -131,12 +131,12 @@ class Monitor:
         return faults
 
     def not_shown(self) -> str:
-        """What of the measured axes of the pair, carried by hand, was not seen to agree with the IMUs yet."""
-        told = [(name, watch.imu.not_shown()) for name, watch in zip(NAMES, self._drones, strict=True)]
-        return next((f"{order} within a second (the {name} has not shown it)" for name, order in told if order), "")
+        """Instruction to move the pair by hand so that the IMUs verify the remaining axes; empty if none remain."""
+        orders = [(name, watch.imu.not_shown()) for name, watch in zip(NAMES, self._drones, strict=True)]
+        return next((f"{order} within a second (the {name} has not shown it)" for name, order in orders if order), "")
 
     def _measured(self, phase: State, links: Sequence[DroneLink], now: float) -> list[Fault]:
-        """Streams that stand still, or that the IMU contradicts; watched on the ground as well, said in flight."""
+        """Faults of frozen streams and of contradictions to the IMU; updated on the ground too, reported in flight."""
         found = []
         for number, (name, link, watch) in enumerate(zip(NAMES, links, self._drones, strict=True)):
             sample, sensed, clock = link.telemetry.newest, link.telemetry.sensed, link.telemetry.clock
@@ -145,9 +145,9 @@ class Monitor:
             if sensed is not None:
                 repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
                 still = still or repeated
-            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and now - self._closed <= TOGETHER else []
+            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and now - self._closed_at <= TOGETHER else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
-            if self._settings.dry_run:  # carried by hand it shows its axes as well; at rest it may be quiet
+            if self._settings.dry_run:  # carried by hand it can contradict its IMU, but at rest its streams may freeze
                 own = [fault for fault in own if fault.event is Event.FRAME]
             if own:
                 self.estimators.trusted[number] = False
@@ -169,22 +169,22 @@ class Monitor:
 
 
 class EstimatorWatch:
-    """Checks both estimators. `update` once a tick; `trusted` says whose position may be used."""
+    """Checks both estimators. `update` once a tick; `trusted` (2,) says whose position may be used."""
 
     def __init__(self, rig: Rig, sideways: bool = True, limits: Limits = LIMITS):
-        """`sideways` false: on a stand, where the estimators invent motion along the locked axes."""
+        """Not `sideways`: on a stand, whose locked axes are ignored since the estimates drift along them."""
         self._rig, self._limits = rig, limits
         self._axes = (0, 1, 2) if sideways else (2,)
         self._before: list[Sample | None] = [None, None]
-        self._height, self._climb, self._apart = Sustained(LASTING), Sustained(LASTING), Sustained(REPEATING)
-        self._usual: np.ndarray | None = None  # (3,) mean of what the leader is beside where the stick puts it [m]
-        self._at = 0.0  # [s] of that mean
-        self._doubt = np.zeros(3)  # standard deviation of the distance between both, as the filters have it [m]
+        self._height, self._climb, self._relative = Sustained(LASTING), Sustained(LASTING), Sustained(REPEATING)
+        self._mean: np.ndarray | None = None  # (3,) slow mean of the leader's error against follower and stick [m]
+        self._mean_time = 0.0  # [s] time of that mean
+        self._spread = np.zeros(3)  # (3,) standard deviation of the relative position, by the filters' variances [m]
         self.trusted = [True, True]
-        self.contradiction = False  # of the two drones: it is not known which one is wrong
+        self.contradiction = False  # the estimates contradict each other, and it is unknown which one is wrong
 
     def update(self, samples: Sequence[Sample], healths: Sequence[Health | None], now: float) -> list[Fault]:
-        """What is wrong with the estimates at `now` [s]; a distrust lasts until the flight ends."""
+        """Faults of the estimates at `now` [s]. An estimator that is not trusted once stays so for the flight."""
         found = []
         for number, (sample, health) in enumerate(zip(samples, healths, strict=True)):
             reason = self._jumped(number, sample) or self._uncertain(health)
@@ -192,7 +192,7 @@ class EstimatorWatch:
                 self.trusted[number] = False
                 found.append(Fault(Event.ESTIMATOR, f"{NAMES[number]}: {reason}"))
         known = [health.variance for health in healths if health is not None]
-        self._doubt = np.sqrt(np.sum(known, axis=0)) if known else self._doubt
+        self._spread = np.sqrt(np.sum(known, axis=0)) if known else self._spread
         if all(self.trusted):
             found += self._against_each_other(samples, now)
         return found
@@ -218,7 +218,7 @@ class EstimatorWatch:
         return f"position variance {variance:.2g} m2, no more than {self._limits.variance:g} is believed"
 
     def _against_each_other(self, samples: Sequence[Sample], now: float) -> list[Fault]:
-        """Places, heights and climbs of the two ends of one stick, whose attitude both drones measure."""
+        """Compare heights, climbs and relative position of the drones with the stick at its measured attitude."""
         leader, follower = (sample.state for sample in samples)
         matrices = [rotations.matrix_from_quaternion(state.quaternion) for state in (leader, follower)]
         matrix, span = 0.5 * (matrices[0] + matrices[1]), self._rig.span
@@ -228,12 +228,12 @@ class EstimatorWatch:
         faster = float((leader.velocity - follower.velocity - matrix @ turning)[2])
         details = {
             f"the leader's height is {100 * beside[2]:+.0f} cm from where the follower and the roll put it": (
-                self._height.update(abs(beside[2]) > max(HEIGHT, DOUBT * math.sqrt(2) * self._limits.noise), now)
+                self._height.update(abs(beside[2]) > max(HEIGHT, SIGMAS * math.sqrt(2) * self._limits.noise), now)
             ),
             f"the leader climbs {faster:+.1f} m/s against the follower": self._climb.update(abs(faster) > CLIMB, now),
         }
         apart = self._moved_apart(beside, now)
-        details[f"the leader moved {1000 * apart:.0f} mm from where the stick puts it"] = self._apart.update(
+        details[f"the leader moved {1000 * apart:.0f} mm from where the stick puts it"] = self._relative.update(
             apart > 0, now
         )
         found = [Fault(Event.ESTIMATOR, detail) for detail, holds in details.items() if holds][:1]
@@ -241,22 +241,22 @@ class EstimatorWatch:
         return found
 
     def _moved_apart(self, beside: np.ndarray, now: float) -> float:
-        """How far `beside` (3,) [m], of the leader from where the stick puts it, is from where it was [m].
+        """Largest change [m] of `beside` (3,), the leader's position error against follower and stick; 0 within noise.
 
-        0 as long as that may be noise. What lasts, of two frames or mounts, is no fault: a slow mean is taken off.
+        The change is from a slow mean: a constant error, of the frames or mounts, is no fault.
         """
-        if self._usual is None:
-            self._usual, self._at = beside, now
-        moved = beside - self._usual
-        self._usual = self._usual - math.expm1((self._at - now) / USUAL) * moved
-        self._at = now
-        beyond = np.abs(moved)[list(self._axes)] > np.maximum(APART, DOUBT * self._doubt[list(self._axes)])
+        if self._mean is None:
+            self._mean, self._mean_time = beside, now
+        moved = beside - self._mean
+        self._mean = self._mean - math.expm1((self._mean_time - now) / USUAL) * moved
+        self._mean_time = now
+        beyond = np.abs(moved)[list(self._axes)] > np.maximum(APART, SIGMAS * self._spread[list(self._axes)])
         return float(np.abs(moved)[list(self._axes)].max()) if beyond.any() else 0.0
 
     def object(self, samples: Sequence[Sample], fresh: Sequence[bool]) -> ObjectState | None:
-        """The object's state from those that are fresh and trusted; None if there is none.
+        """The object's state from the fresh and trusted estimates; None if there is none.
 
-        Where the two contradict each other, the lower height and the faster descent count.
+        If the two contradict each other, it has the lower height and the faster descent.
         """
         states = [sample.state for sample in samples]
         good = [one and known for one, known in zip(self.trusted, fresh, strict=True)]
@@ -276,9 +276,9 @@ class EstimatorWatch:
 
 
 class UplinkWatch:
-    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago, and moves as that does.
+    """Whether one drone acts on its setpoints: the thrust in force was sent recently, and changes as the sent one does.
 
-    One that stands still tells a lost uplink before it is too old, even if its number happens to be sent again.
+    A constant thrust in force shows a lost uplink before it is too old, even if its value happens to be sent again.
     """
 
     def __init__(self, name: str):
@@ -286,33 +286,33 @@ class UplinkWatch:
         self._sent: collections.deque[tuple[float, int]] = collections.deque()
         self._missing = 0
         self._checked, self._before = -math.inf, math.nan
-        self.heard = -math.inf  # [s] when the last thrust that it acted on was sent
-        self.hears = True  # by the newest health packet, beyond what chance may match
+        self.heard = -math.inf  # [s] send time of the last thrust that it acted on
+        self.hears = True  # whether the newest health packet shows that it acts on setpoints
 
     @property
     def frozen(self) -> Fault:
-        """Of a drone that acts on nothing because it does nothing."""
+        """The fault of a drone that does not act on setpoints because all its values are frozen."""
         return Fault(
             Event.FROZEN,
             f"all numbers of the {self._name} stand still: its IMU is dead, or its control or its estimator hangs",
         )
 
     def sent(self, thrust: int, now: float) -> None:
-        """`thrust` [units] goes out at `now` [s]."""
+        """Add a sent `thrust` [units] at `now` [s]."""
         self._sent.append((now, thrust))
 
     def update(self, health: Health, arrival: float) -> list[Fault]:
-        """Check a health packet that came at `arrival` [s]; the same one is checked once."""
+        """Check a health packet that arrived at `arrival` [s], once; return the fault if it is not heard."""
         if arrival <= self._checked or not math.isfinite(health.thrust):
             return []
         self._checked = arrival
         while self._sent and self._sent[0][0] < arrival - ECHO:
             self._sent.popleft()
         moved, self._before = health.thrust != self._before, health.thrust
-        times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < SAME]
+        times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < ROUNDING]
         recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
-        # What stands still in force is most of what was sent of late, as at a bound; another one was lost.
-        usual = sum(abs(thrust - health.thrust) < SAME for thrust in recent) >= len(recent) / 2
+        # A constant thrust in force is right if most recent ones were equal to it, as at a bound; else one was lost.
+        usual = sum(abs(thrust - health.thrust) < ROUNDING for thrust in recent) >= len(recent) / 2
         self.hears = bool(times) and (moved or usual)
         if self.hears:
             self._missing, self.heard = 0, max(self.heard, times[-1])

@@ -1,6 +1,6 @@
-"""Bytes on the wire <-> numbers in SI units: the packed state of a drone and the setpoint it is sent.
+"""Bytes on the wire <-> values in SI units: the packed state of a drone, setpoints, commands, poses.
 
-Every sign and scale of the Crazyflie's protocol lives here and nowhere else. Pure; NumPy and the standard library.
+All signs and scales of the Crazyflie's protocol are here. Pure; NumPy and the standard library only.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mjxball.control import crazyflie
 
 THRUST_FLOOR, THRUST_CEILING = crazyflie.THRUST_FLOOR, crazyflie.THRUST_CEILING  # of what is sent [thrust units]
 
-# One log packet holds everything that is known about a drone: 26 bytes, the protocol's limit.
+# One log packet of 26 bytes, the protocol's limit, holds the whole state of a drone.
 STATE_VARIABLES: tuple[tuple[str, str], ...] = (
     ("stateEstimateZ.x", "int16_t"),  # [mm]
     ("stateEstimateZ.y", "int16_t"),
@@ -37,8 +37,8 @@ _SETPOINT = struct.Struct("<fffH")
 SETPOINT_SIZE = _SETPOINT.size
 MILLI = 1e-3
 
-# A second log packet of at most 24 bytes tells whether estimator, motors and uplink of a drone are well. The lines are
-# alternatives: the first whose variables the firmware lists is taken, none if there is none.
+# A second log packet of at most 24 bytes shows the health of a drone's estimator, motors and uplink. The rows of
+# `MOTORS` are alternatives: the first one that the firmware lists is logged.
 VARIANCES = tuple((f"kalman.var{axis}", "float") for axis in "XYZ")  # [m2] (varPX and so on are of the velocity)
 MOTORS = (
     tuple((f"motor.m{number}", "uint16_t") for number in (1, 2, 3, 4)),  # [PWM]
@@ -46,7 +46,7 @@ MOTORS = (
 )
 ACTING_THRUST = ("controller.cmd_thrust", "float")  # [thrust units] of the setpoint that is in force
 
-# A third log packet of 26 bytes: what the accelerometer feels, and the pose from outside that the firmware took last.
+# A third log packet of 26 bytes: specific force of the accelerometer, and the newest external pose of the firmware.
 SENSED: tuple[tuple[str, str], ...] = (
     *((f"acc.{axis}", "FP16") for axis in "xyz"),  # [g], body axes
     *((f"locSrv.{axis}", "float") for axis in "xyz"),  # [m]
@@ -58,11 +58,11 @@ CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bi
 
 
 class PacketError(ValueError):
-    """Bytes that are no packet of the expected kind."""
+    """Bytes or values that do not form a valid packet."""
 
 
 class DroneState(NamedTuple):
-    """What one drone reports about itself."""
+    """Estimated state, supervisor bits and battery of one drone."""
 
     position: np.ndarray  # (3,) in the world [m]
     velocity: np.ndarray  # (3,) in the world [m/s]
@@ -73,7 +73,7 @@ class DroneState(NamedTuple):
 
 
 class Health(NamedTuple):
-    """What one drone reports about its estimator, its motors and what it acts on."""
+    """Position variance, motor PWM and thrust in force of one drone."""
 
     variance: tuple[float, float, float]  # of the estimated position [m2]
     motors: tuple[int, int, int, int]  # PWM 0 .. 65535
@@ -81,15 +81,15 @@ class Health(NamedTuple):
 
 
 class Sensed(NamedTuple):
-    """What one drone's accelerometer feels, and the pose from outside that it took last, as the bits came."""
+    """Specific force of one drone's accelerometer and its newest external pose, unfiltered."""
 
-    force: tuple[float, float, float]  # specific, body axes [m/s2]
+    force: tuple[float, float, float]  # specific force, body axes [m/s2]
     position: tuple[float, float, float]  # [m]; 0 if no pose ever came
-    quaternion: tuple[float, float, float, float]  # body -> world (w, x, y, z), coarse: 11 bits a number
+    quaternion: tuple[float, float, float, float]  # body -> world (w, x, y, z), coarse: 11-bit significands
 
 
 class Setpoint(NamedTuple):
-    """What one drone is sent, in the wire's units and signs (`send_setpoint` negates pitch; this is after that).
+    """Setpoint of one drone in the wire's units and signs, after the negation of pitch in cflib's `send_setpoint`.
 
     Positive roll moves toward -y, *negative* pitch moves toward +x, positive yaw rate turns clockwise from above.
     """
@@ -106,7 +106,7 @@ ZERO = Setpoint(0.0, 0.0, 0.0, 0)
 def setpoint(roll: float, pitch: float, yaw_rate: float, thrust: float) -> Setpoint:
     """Setpoint for Z-X-Y `roll`, `pitch` [rad] and `yaw_rate` about +z [rad/s]; `thrust` is rounded to units.
 
-    Raises PacketError for a number that is not finite or a thrust beyond 16 bits.
+    Raises PacketError for a value that is not finite or a thrust beyond 16 bits.
     """
     if not all(map(math.isfinite, (roll, pitch, yaw_rate, thrust))):
         raise PacketError("a command is not finite")
@@ -129,14 +129,14 @@ def pack_setpoint(value: Setpoint) -> bytes:
 
 
 def unpack_setpoint(data: bytes) -> Setpoint:
-    """The setpoint in 14 bytes; its floats may be anything. Raises PacketError for another length."""
+    """The setpoint in 14 bytes; its floats are not checked. Raises PacketError for another length."""
     if len(data) != SETPOINT_SIZE:
         raise PacketError(f"a setpoint has {SETPOINT_SIZE} bytes, not {len(data)}")
     return Setpoint(*_SETPOINT.unpack(data))
 
 
 def unpack_state(data: bytes) -> DroneState:
-    """The drone's state in 26 bytes. Raises PacketError for another length or a quaternion that is none."""
+    """The drone's state in 26 bytes. Raises PacketError for another length or an invalid quaternion."""
     if len(data) != STATE_SIZE:
         raise PacketError(f"a state has {STATE_SIZE} bytes, not {len(data)}")
     x, y, z, vx, vy, vz, compressed, roll, pitch, yaw, info, battery = STATE.unpack(data)
@@ -146,7 +146,7 @@ def unpack_state(data: bytes) -> DroneState:
 
 
 def health_of(values: Mapping[str, float]) -> Health:
-    """Health from log variables by name; motors that are not among them stand still, an unknown thrust is NaN."""
+    """Health from log variables by name; missing motors are 0, a missing thrust is NaN."""
     known = next((names for names in MOTORS if names[0][0] in values), ())
     motors = [int(values[name]) for name, _ in known] or [0] * 4
     variance = [float(values[name]) for name, _ in VARIANCES]
@@ -155,7 +155,7 @@ def health_of(values: Mapping[str, float]) -> Health:
 
 
 def sensed_of(values: Mapping[str, float]) -> Sensed:
-    """What was sensed, from log variables by name; numbers that are not among them are 0."""
+    """Sensed values from log variables by name; missing ones are 0."""
     x, y, z = (GRAVITY * values.get(f"acc.{axis}", 0.0) for axis in "xyz")
     place = [values.get(f"locSrv.{axis}", 0.0) for axis in "xyz"]
     w, i, j, k = (values.get(f"locSrv.q{part}", 0.0) for part in "wxyz")
@@ -186,18 +186,18 @@ POSE_PORT, EXTERNAL_POSE = 6, 8
 
 
 def pose_packet(position: Sequence[float], quaternion: Sequence[float]) -> Packet:
-    """A pose (3,) [m] and (4,) (w, x, y, z), body -> world, that the drone's estimator takes for a measurement.
+    """An external pose for the drone's estimator: position (3,) [m], quaternion (4,) (w, x, y, z), body -> world.
 
-    Raises PacketError for a number that is not finite or a quaternion that is not one of unit length.
+    Raises PacketError for a value that is not finite or a quaternion that is not of unit length.
     """
     w, x, y, z = map(float, quaternion)
-    numbers = (*map(float, position), x, y, z, w)
-    if not all(map(math.isfinite, numbers)) or abs(w * w + x * x + y * y + z * z - 1) > 1e-3:
+    values = (*map(float, position), x, y, z, w)
+    if not all(map(math.isfinite, values)) or abs(w * w + x * x + y * y + z * z - 1) > 1e-3:
         raise PacketError("a pose is not finite or its quaternion is not one of unit length")
-    return Packet(POSE_PORT, 1, POSE.pack(EXTERNAL_POSE, *numbers))
+    return Packet(POSE_PORT, 1, POSE.pack(EXTERNAL_POSE, *values))
 
 
-_STEPS = 511  # a component takes 9 bits and a sign
+_STEPS = 511  # largest magnitude of a component: 9 bits, and a sign
 
 
 def compress_quaternion(quaternion: np.ndarray) -> int:
@@ -219,7 +219,7 @@ def compress_quaternion(quaternion: np.ndarray) -> int:
 
 
 def decompress_quaternion(packed: int) -> np.ndarray:
-    """(w, x, y, z) of 32 bits. Raises PacketError where the three small components leave nothing for the largest."""
+    """(w, x, y, z) from 32 bits. Raises PacketError if the three small components are too large for unit length."""
     largest, wire = packed >> 30, [0.0] * 4
     for index in (3, 2, 1, 0):
         if index != largest:
@@ -227,7 +227,7 @@ def decompress_quaternion(packed: int) -> np.ndarray:
             wire[index] = -size if packed & 0x200 else size
             packed >>= 10
     rest = 1.0 - sum(value * value for value in wire)
-    # Three components of sqrt(1/3) or less belong to a unit quaternion whose largest is the fourth; half a step spare.
+    # The square of the largest component is at least 1/4, less half a step of rounding.
     if rest < 0.24:
         raise PacketError("the quaternion is not one of unit length")
     wire[largest] = math.sqrt(rest)

@@ -1,7 +1,7 @@
-"""Which firmware parameters a file may have written to the drones, and whether they still fly with its gains.
+"""Firmware parameters that a file may set on the drones, and checks of its gains.
 
-Gains are judged by the closed loop that they make: the pair's attitude loop (`control.margins`), both drones with the
-gains of one. It must be stable, with something to spare, and about as fast as the one that the policy was trained on.
+Gains are checked by the margins of the pair's attitude loop (`control.margins`), with the gains of one drone on both.
+The loop must be stable with a margin, and about as fast as the one that the policy was trained on.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from mjxfly.setpoints import CurveName
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
-NOISE = re.compile(r"\.(pN|mN|std|ext\w*Std)")  # standard deviations, which a filter divides by
-DEVIATIONS = (1e-6, 1e3)  # of them
-SPARE = 1.5  # by which the loop's gain may be wrong either way: motors, battery, inertia
-RANGE = 3.0  # factor of the bandwidth, either way: at a third of the gains the shipped loops have 0.38 of theirs
+NOISE = re.compile(r"\.(pN|mN|std|ext\w*Std)")  # standard deviations, by which a filter divides
+DEVIATIONS = (1e-6, 1e3)  # bounds of these
+SPARE = 1.5  # least gain margin, up and down: motors, battery, inertia
+RANGE = 3.0  # allowed change of the bandwidth, up and down: with a third of the gains the shipped loops have 0.38
 
 
 def is_written(name: str) -> bool:
-    """Whether the parameter `name` of a file goes to the drones: a gain, or a setting of their positioning."""
+    """Whether the parameter `name` of a file is written to the drones: a gain, or a setting of their positioning."""
     return name in PARAMETERS or (name.split(".", maxsplit=1)[0] in ESTIMATION and name not in OWN)
 
 
 def check_parameters(config: Config, curves: Sequence[CurveName], more: PairGains, where: str) -> None:
-    """Raise InputError, which begins with `where`, for parameters of leader and follower that would not fly.
+    """Raise InputError, which begins with `where`, for parameters `more` of leader and follower that are unsafe.
 
-    `curves` are those that the drones' firmware may have, by which a policy's own gains differ.
+    They are checked for each of the force `curves` that the firmware may have: the policy's gains depend on it.
     """
     for number, (name, given) in enumerate(zip(NAMES, more, strict=True)):
         for parameter, value in given.items():
@@ -79,7 +79,7 @@ def _check_loops(config: Config, trained: Mapping[str, float], given: Mapping[st
 
 
 def _turned(config: Config) -> list[Axis]:
-    """What the loops turn: the pair of `config`; for another rig, which is not known, one drone alone."""
+    """Axes of the attitude loops of the pair of `config`; of a single drone if it is not a pair of Crazyflies."""
     if is_crazyflie(config):
         return list(axes(config))
     return [axis._replace(gain=axis.gain * axis.inertia_ratio) for axis in axes(configs.preset("flight"))]

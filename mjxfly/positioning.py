@@ -1,6 +1,6 @@
 """Which positioning deck a drone flies on, and whether it is ready, by the firmware's parameters and log variables.
 
-Names and meanings are of bitcraze/crazyflie-firmware 2026.08: lighthouse_core.c, lighthouse_position_est.c, locodeck.c,
+Names and meanings follow bitcraze/crazyflie-firmware 2026.08: lighthouse_core.c, lighthouse_position_est.c, locodeck.c,
 lpsTdoa2Tag.c, lpsTdoa3Tag.c, tdoaEngineInstance.c, flowdeck_v1v2.c. In TDoA 3 ranging.state stays 0, and
 tdoaEngine.stEst is the rate of measurements.
 """
@@ -18,30 +18,30 @@ from mjxfly.limits import Check, Limits
 
 
 class DeckLink(Protocol):
-    """What is asked of a link."""
+    """The part of `link.Link` that is used here."""
 
     name: str
     parameters: Parameters
 
     def read_logs(self, names: Sequence[str]) -> dict[str, float]:
-        """Values of those of the log variables `names` that the firmware lists."""
+        """Values of the log variables `names`, without those that the firmware does not list."""
         ...
 
 
-Verdict = tuple[bool, str]  # whether it is ready, what was found
+Verdict = tuple[bool, str]  # whether the system is ready, and the finding in words
 VELOCITY = tuple(f"kalman.varP{axis}" for axis in "XYZ")  # variances [m2/s2]
 SLOW = 0.3  # [m/s] standard deviation of the velocity of a filter that has converged
-ANCHORS, RATE = 4, 50.0  # of Loco: anchors that are heard, TDoA measurements a second; at least
+ANCHORS, RATE = 4, 50.0  # of Loco: least number of anchors heard, least rate of TDoA measurements [Hz]
 TWR, TDOA2, TDOA3 = 1, 2, 3  # of loco.mode
 
 
 def stations(bits: float) -> str:
-    """Base stations or anchors of a bit field, as Lighthouse channels are counted: "1, 2"."""
+    """The set bits of a bit field of base stations, counted from 1 as Lighthouse channels are: "1, 2"."""
     return ", ".join(str(number + 1) for number in range(16) if int(bits) >> number & 1)
 
 
 def lighthouse_verdict(logs: Mapping[str, float]) -> Verdict:
-    """By what is received, and what is known of it."""
+    """Ready if a base station is received with geometry and calibration, and is used."""
     seen, used, shape, calibration, confirmed = (
         int(logs.get(f"lighthouse.bs{name}", 0)) for name in ("Receive", "Active", "GeoVal", "CalVal", "CalCon")
     )
@@ -64,7 +64,7 @@ def lighthouse_verdict(logs: Mapping[str, float]) -> Verdict:
 
 
 def loco_verdict(logs: Mapping[str, float]) -> Verdict:
-    """By the mode, and by how much is heard."""
+    """Ready in TDoA mode with enough anchors or measurements."""
     mode, heard, rate = int(logs.get("loco.mode", 0)), int(logs.get("ranging.state", 0)), logs.get("tdoaEngine.stEst")
     if mode == TWR:
         return False, "TWR ranges with one drone alone: set the anchors to TDoA 3"
@@ -80,7 +80,7 @@ def loco_verdict(logs: Mapping[str, float]) -> Verdict:
 
 
 def flow_verdict(logs: Mapping[str, float]) -> Verdict:
-    """Never good for two drones that hold one object."""
+    """Never ready: positions of a Flow deck are relative, and the two drones need a common frame."""
     return False, (
         "a Flow deck alone counts from where its filter was reset, and two drones on one stick need one frame: "
         "fly with Lighthouse, Loco or --mocap"
@@ -89,18 +89,18 @@ def flow_verdict(logs: Mapping[str, float]) -> Verdict:
 
 @dataclass(frozen=True)
 class System:
-    """A positioning system whose decks the firmware knows."""
+    """A positioning system with a deck that the firmware detects."""
 
     name: str
-    decks: tuple[str, ...] = ()  # parameters that are not 0 where it is there
-    switch: tuple[str, float] = ("", 0.0)  # parameter, and its value at which nothing reaches the estimator
-    logs: tuple[str, ...] = ()
-    verdict: Callable[[Mapping[str, float]], Verdict] = lambda logs: (True, "not told by the firmware")
-    noise: float = 0.0  # of a position beyond motion capture's, standard deviation [m]
-    variance: float = Limits.variance  # of the estimated position that is believed in flight [m2]
+    decks: tuple[str, ...] = ()  # parameters that are not 0 if the deck is present
+    switch: tuple[str, float] = ("", 0.0)  # parameter, and its value that keeps measurements from the estimator
+    logs: tuple[str, ...] = ()  # log variables for `verdict`
+    verdict: Callable[[Mapping[str, float]], Verdict] = lambda logs: (True, "not reported by the firmware")
+    noise: float = 0.0  # of the positions beyond that of motion capture, standard deviation [m]
+    variance: float = Limits.variance  # of a position estimate that is trusted in flight [m2]
 
     def widen(self, limits: Limits) -> Limits:
-        """`limits` as wide as positions of this system need."""
+        """`limits` with noise and variance raised to those of this system."""
         return replace(limits, noise=max(limits.noise, self.noise), variance=max(limits.variance, self.variance))
 
 
@@ -121,31 +121,31 @@ LOCO = System(
     variance=2e-3,
 )
 FLOW = System("Flow", ("deck.bcFlow2", "deck.bcFlow"), ("motion.disable", 1.0), (), flow_verdict)
-SYSTEMS = (LIGHTHOUSE, LOCO, FLOW)  # the first that is there counts: the others add to it
-UNKNOWN = System("unknown")  # no deck that is known: motion capture, or a firmware that lists none
+SYSTEMS = (LIGHTHOUSE, LOCO, FLOW)  # the first one present is the drone's system, the others supplement it
+UNKNOWN = System("unknown")  # no known deck: motion capture, or firmware without these parameters
 
 
 def system_of(values: Mapping[str, float]) -> System:
-    """The system by values of parameters; `UNKNOWN` if none of its decks is there."""
+    """The system by the values of deck parameters; `UNKNOWN` if no known deck is present."""
     return next((one for one in SYSTEMS if any(values.get(name) for name in one.decks)), UNKNOWN)
 
 
 def found(link: DeckLink) -> System:
-    """The system of a drone. Raises LinkError."""
+    """The system of a drone, by its deck parameters. Raises LinkError."""
     return system_of(link.parameters.read(link.parameters.listed(name for one in SYSTEMS for name in one.decks)))
 
 
 def common(links: Sequence[DeckLink]) -> System:
-    """The system of both drones. Raises LinkError if they differ: their frames would."""
+    """The system of both drones. Raises LinkError if they differ, since their frames would differ too."""
     one, other = (found(link) for link in links)
     if one is not other:
-        told = " and ".join(f"{system.name} ({link.name})" for system, link in zip((one, other), links, strict=True))
-        raise LinkError(f"both drones need one positioning system, not {told}: fit one kind to both")
+        both = " and ".join(f"{system.name} ({link.name})" for system, link in zip((one, other), links, strict=True))
+        raise LinkError(f"both drones need one positioning system, not {both}: fit one kind to both")
     return one
 
 
 def check(link: DeckLink) -> Check | None:
-    """Whether the system of a drone is ready; None if its firmware tells of none. Raises LinkError."""
+    """Whether the system of a drone is ready; None if no known deck is present. Raises LinkError."""
     system = found(link)
     if system is UNKNOWN:
         return None
@@ -162,7 +162,7 @@ def check(link: DeckLink) -> Check | None:
 
 
 def wait(link: DeckLink, seconds: float) -> None:
-    """Give the system `seconds` to be ready. Raises LinkError with what is missing."""
+    """Wait until the system is ready. Raises LinkError with what is missing after `seconds`."""
     began = clock.now()
     while (state := check(link)) is not None and not state.passed:
         if found(link) is FLOW or clock.now() - began > seconds:

@@ -1,7 +1,6 @@
-"""Before the pair may lift: connect, gains, estimators, states, checks; and which force curve each firmware has.
+"""Preflight: connect, write gains, reset estimators, check states; and recognise each firmware's force curve.
 
-The curve is found while the motors turn slowly, and the gains for it are then written.
-
+The curve is recognised while the motors turn slowly; the gains for it are then written.
 """
 
 from __future__ import annotations
@@ -37,18 +36,18 @@ from mjxfly.telemetry import DroneLink, Note, Rig, yaw_of
 
 @dataclass(frozen=True)
 class Preflight:
-    """What is required of a pair on the ground."""
+    """Requirements on a pair on the ground."""
 
     rate: float = 90.0  # states per second of each drone
     measure: float = 1.0  # time over which the rate is measured [s]
     variance: float = 1e-3  # of the estimator's position [m2]
-    converge: float = 10.0  # time the estimators get [s]
+    converge: float = 10.0  # time for the estimators to converge [s]
     tilt: float = math.radians(8)  # [rad]
     yaw: float = math.radians(15)  # from the world's x axis [rad]
-    apart: float = math.radians(8)  # between both yaws, which the stick holds equal [rad]
+    apart: float = math.radians(8)  # between the drones' yaws, which are equal on a stick [rad]
     gravity: float = math.radians(5)  # between the accelerometer's up and the attitude's [rad]
     length: float = 0.03  # of the distance between both from the stick's length [m]
-    rearm: float = 4.0  # time that a firmware gets to settle after a landing [s]
+    rearm: float = 4.0  # time for the firmware to settle after a landing [s]
     reset: float = 0.1  # time between the two writes that reset an estimator [s]
     drone: str = "2.1"  # which Crazyflie the policy was trained for, a key of `motors.MOTORS`
 
@@ -73,9 +72,9 @@ def read_gains(path: Path) -> PairGains:
 
 
 def parameters_of(gains: Gains, on_board: bool) -> Gains:
-    """What a flight writes to a drone: its gains and the controller, which another program or flight may have changed.
+    """Parameters that a flight writes to a drone: gains and the firmware's controller.
 
-    `on_board` it is the app's own: the firmware hands an app the state under no other one.
+    Another program or flight may have changed the controller. An app `on_board` gets the state only if it is its own.
     """
     return {**gains, CONTROLLER: float(OUT_OF_TREE if on_board else PID)}
 
@@ -88,10 +87,10 @@ def prepare(
     mocap: Mocap | None = None,
     check_app: Callable[[int, Link], None] | None = None,
 ) -> list[CurveName]:
-    """Open both links at once, write each drone's gains, start the states, reset the estimators. Raises InputError.
+    """Open both links in parallel, write gains, start the states, reset the estimators. Raises InputError.
 
-    Returns the force curves that the firmwares' versions promise, whose gains were written. With `mocap`, poses go to
-    each drone from before its estimator is reset. `check_app` refuses a drone without the app of a flight on board.
+    Returns the force curves expected by the firmwares' versions, whose gains were written. With `mocap`, poses are
+    forwarded to each drone before its estimator is reset. `check_app` checks the app of a flight on board.
     """
     curves: dict[str, CurveName] = {}
 
@@ -115,20 +114,20 @@ def prepare(
 
 
 def promised_curve(link: Link, own: Variants) -> CurveName:
-    """The force curve of the drone's firmware by its version. Raises LinkError if there are no gains for it."""
+    """Expected force curve of the drone's firmware, by its version. Raises LinkError if there are no gains for it."""
     known, first = curve_of_version(link.identity.version), next(iter(own))
     if known is None or known in own:
         return known or first
     raise LinkError(
         f"the firmware {link.identity.version} of the {link.name} has the {known} force curve, "
-        f"and this flight has gains for the {first} one only: {OTHER}"
+        f"and this flight has gains for the {first} one only: {CURVE_REMEDY}"
     )
 
 
 def check_kind(link: Link, required: Preflight, measured: bool = False) -> None:
-    """The drone is of the kind that the policy was trained for, and knows its position, unless that is `measured` here.
+    """Raise LinkError if the drone is not of the kind that the policy was trained for, or has no position.
 
-    Raises LinkError.
+    If its position is `measured` by motion capture, only the kind is checked.
     """
     device, brushless = link.identity.device, "brushless" in link.identity.device.lower()
     if device.startswith("Crazyflie 2") and brushless != (required.drone == "brushless"):
@@ -165,22 +164,22 @@ def reset_estimator(link: Link, required: Preflight) -> None:
         good = good + 1 if min(sample.health.variance) > 0 and found < required.variance else 0
 
 
-def _ready(info: int) -> bool:
+def _can_start(info: int) -> bool:
     return bool(info & (packets.CAN_ARM | packets.CAN_FLY)) and not info & packets.FLYING
 
 
 def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
-    """Wait for firmwares that still count as flying, or disarm and arm again, as they do 3 s after a landing."""
+    """Wait while a firmware still counts as flying, or disarms and arms again, as it does 3 s after a landing."""
 
     def settled() -> bool:
         infos = [link.telemetry.newest.state.info for link in links if link.telemetry.newest is not None]
-        return all(_ready(info) or down_reason(info, armed=False) for info in infos)
+        return all(_can_start(info) or down_reason(info, armed=False) for info in infos)
 
     wait_until(settled, seconds)
 
 
 def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) -> list[Check]:
-    """All checks, with what was found; takes `required.measure` seconds, more if a firmware re-arms after a landing."""
+    """All preflight checks; takes `required.measure` seconds, more if a firmware arms again after a landing."""
     _wait_until_ready(links, required.rearm)
     began = clock.now()
     before = [link.telemetry.received for link in links]
@@ -194,7 +193,7 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
         state, age = sample.state, link.telemetry.age(now)
         states.append(state)
         refusal = down_reason(state.info, armed=False)
-        can = _ready(state.info)
+        can = _can_start(state.info)
         tilt, yaw = tilt_angle(state.quaternion), yaw_of(state)
         fresh, alive = rate >= required.rate, refusal or ("can fly" if can else "cannot arm")
         rows: tuple[tuple[str, bool, str, str], ...] = (
@@ -210,14 +209,14 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
     return [*checks, heading_check(states, required), stick_check(states, rig, bounds, required)]
 
 
-OTHER = "leave --curve out, or take other firmware or another policy"
+CURVE_REMEDY = "leave --curve out, or take other firmware or another policy"
 BUSY = "take a free radio channel, come closer, end other programs"
 TURNED = "turn it, or its body in the cameras' program, to look along +x"
 YAW_COST = 6  # [mm] of hover error for each degree between both yaws: 29 mm for 5 on the real firmware
 
 
 def heading_check(states: Sequence[DroneState], required: Preflight) -> Check:
-    """Whether both drones, which one stick holds, measure one yaw; the difference is the frames' or the bodies'."""
+    """Whether both drones on one stick measure the same yaw; a difference is due to their frames or mounting."""
     beside = math.degrees(math.remainder(yaw_of(states[0]) - yaw_of(states[1]), 2 * math.pi))
     text = f"leader {beside:+z.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
     remedy = "turn both alike on the stick, or their bodies in the cameras' program"
@@ -225,7 +224,7 @@ def heading_check(states: Sequence[DroneState], required: Preflight) -> Check:
 
 
 def gravity_checks(link: Link, state: DroneState, required: Preflight) -> list[Check]:
-    """Whether a standing drone feels gravity where its attitude says; none if nothing is known of it."""
+    """Whether a standing drone's accelerometer agrees with its attitude; no check without accelerometer data."""
     sample = link.telemetry.sensed
     if sample is None:
         return []
@@ -239,11 +238,11 @@ def gravity_checks(link: Link, state: DroneState, required: Preflight) -> list[C
     return [Check.judged(f"{link.name} gravity", good, text, remedy)]
 
 
-NOISY = 4.0  # standard deviations of a position that a check allows
+NOISY = 4.0  # standard deviations of the positions that the check allows
 
 
 def stick_check(states: Sequence[DroneState], rig: Rig, bounds: Limits, required: Preflight) -> Check:
-    """Whether both drones are where the stick holds them, as far from each other as it is long."""
+    """Whether the drones' relative position and distance agree with the stick."""
     faults = stick_faults(states, rig.span, bounds)
     line = states[0].position - states[1].position
     beside = float(np.linalg.norm(line - rig.span))
@@ -256,14 +255,14 @@ def stick_check(states: Sequence[DroneState], rig: Rig, bounds: Limits, required
     return Check.judged("stick", placed, faults[0].detail if faults else text, remedy)
 
 
-COMPENSATES_SINCE = (2025, 12)  # version of the firmware, as delivered
-LIKELY = 0.12  # of ln(PWM / expected PWM): half of what lies between the two firmwares at a full battery
-WANTED = 3  # health packets in a row that agree
+COMPENSATES_SINCE = (2025, 12)  # first version of the released firmware with battery compensation
+MAX_LOG_RATIO = 0.12  # largest |ln(PWM / expected PWM)|: half the difference between the two curves at a full battery
+AGREEING = 3  # consecutive health packets that must agree
 RESERVE = 0.97  # of the largest thrust command, above which a pair has no reserve to hover
 
 
 def curve_of_version(version: str) -> CurveName | None:
-    """What a firmware of this `version`, such as 2026.08, has as delivered; None if it does not say."""
+    """Force curve of released firmware of this `version`, such as 2026.08; None if the version has another form."""
     found = re.match(r"(20\d\d)\.(\d\d)", version)
     if found is None:
         return None
@@ -271,9 +270,9 @@ def curve_of_version(version: str) -> CurveName | None:
 
 
 def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
-    """Which firmware makes the PWM that was `seen` of the thrust that it reports; None if neither does.
+    """The force curve that maps the reported thrust to the PWM `seen`; None if neither does. `battery` in V.
 
-    The mean of the four motors counts, in which roll, pitch and yaw cancel. `battery` in V.
+    The mean PWM of the four motors is used, in which roll, pitch and yaw commands cancel.
     """
     pwm, thrust = float(np.mean(seen.motors)), seen.thrust
     if not (pwm > 0 and thrust > 0 and battery > 0):
@@ -282,11 +281,11 @@ def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
     expected = {"linear": compensated, "older": thrust}
     off = {name: abs(math.log(pwm / value)) if value > 0 else math.inf for name, value in expected.items()}
     best = min(CURVE_NAMES, key=lambda name: off[name])
-    return best if off[best] < LIKELY else None
+    return best if off[best] < MAX_LOG_RATIO else None
 
 
 class SpinCheck:
-    """Decides for both drones. `update` once a tick in State.SPIN."""
+    """Recognises the force curves of both drones' firmwares. `update` once a tick in State.SPIN."""
 
     def __init__(
         self, links: Sequence[DroneLink], variants: Sequence[Variants], assumed: Sequence[CurveName], motor: Motor
@@ -296,21 +295,21 @@ class SpinCheck:
         self._seen: list[list[CurveName | None]] = [[], []]
         self._last = [0.0, 0.0]
         self._decided = [False, False]
-        self._unfit: list[str] = []
+        self._failures: list[str] = []
 
     def chosen(self) -> tuple[Variant, Variant]:
-        """How leader and follower are flown, by what is known so far."""
+        """Command map and gains of leader and follower, by the curves known so far."""
         leader, follower = (own[curve] for own, curve in zip(self._variants, self.curves, strict=True))
         return leader, follower
 
     def update(self, since: float, now: float, note: Note) -> list[Fault]:
-        """Check what came after `since` [s], when the motors had settled; events once both are known."""
+        """Check health packets after `since` [s], when the motors had settled; return events once both are known."""
         for number in range(2):
             if not self._decided[number]:
-                self._look(number, since, now, note)
+                self._check_health(number, since, now, note)
         failed = [link.busy for link in self._links if isinstance(link.busy, str)]
-        if failed or self._unfit:
-            return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._unfit)]
+        if failed or self._failures:
+            return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._failures)]
         if not all(self._decided):
             return []
         heavy = []
@@ -323,20 +322,20 @@ class SpinCheck:
             return heavy
         return [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
 
-    def _look(self, number: int, since: float, now: float, note: Note) -> None:
+    def _check_health(self, number: int, since: float, now: float, note: Note) -> None:
         telemetry, seen = self._links[number].telemetry, self._seen[number]
         sample, state = telemetry.health, telemetry.newest
         if sample is None or state is None or sample.arrival <= max(since, self._last[number]):
             return
         self._last[number] = sample.arrival
-        if not any(sample.health.motors) and len(seen) < 2 * WANTED:
+        if not any(sample.health.motors) and len(seen) < 2 * AGREEING:
             seen.append(None)  # not listed by this firmware, or not turning yet
             return
         found = recognise(sample.health, state.state.battery, self._motor)
         seen.append(found)
-        if found is not None and seen[-WANTED:] == [found] * WANTED:
+        if found is not None and seen[-AGREEING:] == [found] * AGREEING:
             self._decide(number, found, now, note, True)
-        elif len(seen) >= 4 * WANTED:  # neither fits: what was assumed stands
+        elif len(seen) >= 4 * AGREEING:  # neither fits: keep the assumed curve
             self._decide(number, self.curves[number], now, note, False)
 
     def _decide(self, number: int, curve: CurveName, now: float, note: Note, recognised: bool) -> None:
@@ -344,7 +343,7 @@ class SpinCheck:
         changed = curve != self.curves[number]
         if curve not in self._variants[number]:
             text = f"the {NAMES[number]} has the {curve} force curve, which this flight has no gains for"
-            self._unfit.append(f"{text}: {OTHER}")
+            self._failures.append(f"{text}: {CURVE_REMEDY}")
         elif changed:
             self.curves[number] = curve
             self._links[number].write_later(self._variants[number][curve].gains)

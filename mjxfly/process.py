@@ -1,4 +1,4 @@
-"""Clocks, threads and processes: deadlines of the control loop, its priority, waiting with a limit, child processes."""
+"""Threads and processes: timing and priority of the control loop, waiting with a limit, child processes."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ class Timing:
     """Lateness of the loop's ticks against their deadlines [s]."""
 
     ticks: int
-    missed: int  # deadlines that passed before the tick before was done
+    missed: int  # deadlines that passed during the previous tick
     median: float
     p99: float
     largest: float
 
 
 class Metronome:
-    """Wakes once per period. A tick that is late does not shift the later ones; deadlines passed over are counted."""
+    """Wakes once per period. A late tick does not shift later ones; skipped deadlines are counted."""
 
     def __init__(self, period: float):
         self.period = period
         self.missed = 0
         self._late: list[float] = []
         self._misses: collections.deque[float] = collections.deque()
-        self.lateness = self.gap = 0.0  # of the last tick, and between the last two [s]
+        self.lateness = self.gap = 0.0  # lateness of the last tick, time between the last two [s]
         self.start()
 
     def start(self) -> None:
-        """The first deadline is one period from now."""
+        """Set the first deadline to one period from now."""
         self._before = clock.now()
         self._deadline = self._before + self.period
 
     def wait(self) -> float:
-        """Sleep until the next deadline; returns the monotonic time [s]."""
+        """Sleep until the next deadline; return the time after it [s]."""
         while (left := self._deadline - clock.now()) > 0:
             clock.sleep(left)
         now = clock.now()
@@ -70,15 +70,15 @@ class Metronome:
         return Timing(len(self._late), self.missed, late[len(late) // 2], late[int(0.99 * (len(late) - 1))], late[-1])
 
 
-REAL_TIME = 5  # priority among real-time threads, low: the kernel's own stay ahead
+REAL_TIME = 5  # priority among real-time threads, low: those of the kernel come first
 
 
 @contextlib.contextmanager
 def urgent(above: int = 0) -> Iterator[str]:
-    """Run this thread, and those and the processes that it starts, before all others where the system allows it.
+    """Raise the priority of this thread, and of threads and processes that it starts, if the system allows it.
 
-    Of two that are urgent, the one `above` goes first. Yields what was granted: real time (root, or a limit on rtprio),
-    a better nice value, or nothing.
+    `above` adds to the real-time priority. Yields what was granted: "real time" (root, or a limit on rtprio), a better
+    nice value, or "nothing".
     """
     granted, undo = "nothing", contextlib.ExitStack()
     with contextlib.suppress(OSError, AttributeError):
@@ -98,9 +98,9 @@ def urgent(above: int = 0) -> Iterator[str]:
 
 
 def bounded(action: Callable[[], Any], seconds: float) -> bool:
-    """Run `action` in a thread; false if it has not returned after `seconds`, it is then left behind.
+    """Run `action` in a thread; false if it has not returned after `seconds` and is left running.
 
-    cflib waits without limit in places, and some of its callbacks can lock each other out.
+    Some calls of cflib wait without limit, and some of its callbacks can deadlock.
     """
     thread = threading.Thread(target=action, daemon=True)
     thread.start()
@@ -109,7 +109,7 @@ def bounded(action: Callable[[], Any], seconds: float) -> bool:
 
 
 def together(actions: Sequence[Callable[[], None]]) -> None:
-    """Run all `actions` at once; raise the first one's error after all have ended."""
+    """Run all `actions` in parallel; raise the first error after all have ended."""
     errors: list[Exception] = []
 
     def guarded(action: Callable[[], None]) -> None:
@@ -128,7 +128,7 @@ def together(actions: Sequence[Callable[[], None]]) -> None:
 
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
-    """True once `condition` holds, false if it does not within `seconds`."""
+    """Wait until `condition` holds; false if it does not within `seconds`."""
     end = clock.now() + seconds
     while not condition():
         if clock.now() > end:
@@ -138,15 +138,15 @@ def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
 
 
 class Child:
-    """`python -m MODULE ...` that prints one line when it is ready and ends when its standard input does.
+    """A process `python -m MODULE ...` that prints one line when it is ready and ends when its standard input closes.
 
-    A context manager. Ctrl-C does not reach it: what it serves lands first.
+    A context manager. Ctrl-C is not sent to it: it must serve the flight until that has landed.
     """
 
     def __init__(self, arguments: Sequence[str], failure: str, start_limit: float = 30.0, late: str = ""):
         """Start it. Raises InputError with the sentence `failure` if it ends, or is not ready within `start_limit` [s].
 
-        `late` is the sentence for the latter, if it is another one. A process that has refused its input ends this one.
+        `late` replaces `failure` in the second case. If the child refuses its input (code 2), this process exits too.
         """
         self._process = subprocess.Popen(
             [sys.executable, "-m", *arguments],
@@ -160,7 +160,7 @@ class Child:
         self.line = self._process.stdout.readline().strip() if readable else ""
         if not self.line:
             self.close()
-            if self._process.returncode == 2:  # bad input, of which it has said what and why
+            if self._process.returncode == 2:  # bad input, on which it has printed a message
                 sys.exit(2)
             raise InputError(failure if readable else late or failure)
 
@@ -171,7 +171,7 @@ class Child:
         self.close()
 
     def close(self) -> None:
-        """Close its input and wait for its end; kill it after 5 s."""
+        """Close its input and wait for it to end; kill it after 5 s."""
         try:
             with contextlib.suppress(OSError, ValueError):
                 self._process.communicate(timeout=5)

@@ -1,4 +1,4 @@
-"""The flight in a log: what it flew with and what is missing; as arrays, a row per tick; flown again on the twin."""
+"""The flight in a log: firmware setup and outages, arrays with a row per tick, and its simulation on the twin."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ from mjxfly.twin.conditions import DroneKind, Surroundings, drone_kind
 from mjxfly.twin.pair import PairState
 from mjxfly.twin.physics import pair_of
 
-FROZEN = 0.25  # [s] of equal states from which on an estimator counts as frozen while the laws are in command
-OFF_RATE = 0.2  # share of the control period by which ticks may be apart
-GUIDED = State.FLY.value  # both laws fly
-LONGEST = 3600.0  # [s] of a flight that is read
-OBSERVATION = 18  # numbers of an observation, where the log holds none
-SAME = 1e-5  # of two gains of which one was sent as a 32-bit float
+FROZEN = 0.25  # [s] of equal states after which an estimator counts as frozen while the controllers are in command
+OFF_RATE = 0.2  # relative deviation of the tick period from the policy's that is reported
+GUIDED = State.FLY.value  # both controllers are in command
+LONGEST = 3600.0  # [s] longest flight that is read
+OBSERVATION = 18  # length of an observation if the log has none
+SAME = 1e-5  # relative tolerance between equal gains, of which one was sent as a 32-bit float
 
 
 class FirmwareSetup(NamedTuple):
-    """Force curves and gains of leader's and follower's firmware, as a log tells."""
+    """Force curves and gains of leader's and follower's firmware, from a log."""
 
     curves: tuple[CurveName, CurveName]
     gains: PairGains
 
     @classmethod
     def of_header(cls, header: Record) -> FirmwareSetup:
-        """What a log's `header` says; a curve that it does not name is the one that the policy's numbers are for."""
+        """The setup in a log's `header`; without a curve there, it is that of the policy's configuration."""
         curve = header.get("curve") or own_curve(header["config"])
         return cls((curve, curve), header["gains"])
 
     def after(self, record: Record, config: Config) -> FirmwareSetup:
-        """What holds after one more record, of a flight by a policy of `config`.
+        """The setup after one more record of a flight with a policy of `config`.
 
-        A firmware that is found to have another curve is given the card's gains for it, and keeps those that were
-        not the card's.
+        If the firmware turns out to have another curve, gains that were the policy's become the policy's for that
+        curve; others are kept.
         """
         if record["kind"] not in ("thrust", "parameter"):
             return self
@@ -67,7 +67,7 @@ class FirmwareSetup(NamedTuple):
         return FirmwareSetup((curves[0], curves[1]), (gains[0], gains[1]))
 
     def force_curves(self, config: Config) -> tuple[ForceCurve, ForceCurve]:
-        """Force of both drones' motors by the thrust that they are sent."""
+        """Force of leader's and follower's motors over the sent thrust."""
         leader, follower = (
             command_maps(with_curve(config, name), ThrustChoice(curve=name))[0].curve for name in self.curves
         )
@@ -75,7 +75,7 @@ class FirmwareSetup(NamedTuple):
 
 
 def own_curve(config: Config) -> CurveName:
-    """The curve of the firmware that the numbers of `config` are for."""
+    """The force curve that `config` was made for."""
     return next(name for name in CURVE_NAMES if with_curve(config, name) is config)
 
 
@@ -85,7 +85,7 @@ def one_curve(curves: tuple[CurveName, CurveName]) -> CurveName | None:
 
 
 def _for_curve(gains: Gains, config: Config, number: int, before: CurveName, after: CurveName) -> Gains:
-    """`gains` of drone `number`, of which those that were the card's for one curve become the card's for another."""
+    """`gains` of drone `number`: those equal to the policy's for curve `before` become the policy's for `after`."""
     old, new = (gains_of(with_curve(config, name))[number] for name in (before, after))
     return {
         name: new[name] if name in old and math.isclose(value, old[name], rel_tol=SAME) else value
@@ -94,30 +94,30 @@ def _for_curve(gains: Gains, config: Config, number: int, before: CurveName, aft
 
 
 class Outage(NamedTuple):
-    """A time in which a drone's states say nothing."""
+    """An interval without states of a drone, or with frozen ones."""
 
     drone: str
-    frozen: bool  # equal states came; else none
+    frozen: bool  # states arrived but did not change; else none arrived
     begin: float  # [s] of the log's clock
     end: float
 
 
 class FlightLog(NamedTuple):
-    """A log that holds a flight, from where its motors first turn to its last tick."""
+    """The flight in a log, from when its motors first turn to its last tick."""
 
     path: Path
     policy: str
     config: Config
     setup: FirmwareSetup  # at the end
-    records: tuple[Record, ...]  # ticks and states alone, in the order of time; the states in force come first
+    records: tuple[Record, ...]  # ticks and states, sorted by time; the newest states before the flight come first
     outages: tuple[Outage, ...]
-    remarks: tuple[str, ...]  # a line each: what a reader should know who relies on it
+    remarks: tuple[str, ...]  # notes on the quality of the data, a line each
 
 
 def load(path: Path, assumed: Config | None = None) -> FlightLog:
-    """The flight in the whole log `path`, of the rig `assumed` if it does not say; see `flight_log.read`.
+    """The flight in the whole log `path`, of the rig `assumed` if the log names none; see `flight_log.read`.
 
-    Raises InputError with one sentence if there is none.
+    Raises InputError if it holds no flight.
     """
     remarks: list[str] = []
     header, *records = flight_log.read(path, remarks.append, assumed)
@@ -154,7 +154,7 @@ def load(path: Path, assumed: Config | None = None) -> FlightLog:
 
 
 def _tick_remarks(times: list[float], config: Config) -> list[str]:
-    """What a reader should know of the ticks' times: holes, and another period than the policy's calls for."""
+    """Notes on the times (T,) [s] of the ticks: gaps, and a period that differs from the policy's."""
     if len(times) < 2:
         return []
     period = config.timing.control_period / ticks_per_command(config.timing.control_period)
@@ -166,7 +166,7 @@ def _tick_remarks(times: list[float], config: Config) -> list[str]:
 
 
 def _faults(rows: Sequence[Record]) -> list[str]:
-    """What is wrong with the clocks of a flight, while both laws are in command."""
+    """Faults of the clocks of a flight while both controllers are in command."""
     ticks = [one for one in rows if one["kind"] == "tick" and one["state"] == GUIDED]
     if len(ticks) < 2:
         return []
@@ -178,7 +178,7 @@ def _faults(rows: Sequence[Record]) -> list[str]:
 
 
 def outages(drone: str, time: np.ndarray, states: np.ndarray, end: float) -> list[Outage]:
-    """Where the rows of `states` (S, n) at `time` (S,) leave a gap, or do not change for long, until `end`."""
+    """Gaps between the rows of `states` (S, n) at `time` (S,) [s] until `end`, and intervals without change."""
     edges = np.append(time, max(end, time[-1]))
     gaps = [(edges[k], edges[k + 1]) for k in np.flatnonzero(np.diff(edges) > SILENCE)]
     changes = np.flatnonzero((np.diff(states, axis=0) != 0).any(axis=1)) + 1
@@ -192,12 +192,12 @@ def outages(drone: str, time: np.ndarray, states: np.ndarray, end: float) -> lis
 
 
 def numbers(state: DroneState) -> np.ndarray:
-    """(13,) position, velocity, quaternion (w, x, y, z), body rates."""
+    """(13,) position [m], velocity [m/s], quaternion (w, x, y, z), body rates [rad/s]."""
     return np.concatenate([state.position, state.velocity, state.quaternion, state.rates])
 
 
 def _outages(rows: tuple[Record, ...], stopped: float) -> tuple[Outage, ...]:
-    """Gaps until the motors have `stopped`; equal states while the laws are in command, since a pair may rest."""
+    """Gaps until the motors have `stopped` [s]; frozen states only in FLY, since those of a resting pair may freeze."""
     guided = [one["t"] for one in rows if one["kind"] == "tick" and one["state"] == GUIDED]
     found = []
     for drone in NAMES:
@@ -211,7 +211,7 @@ def _outages(rows: tuple[Record, ...], stopped: float) -> tuple[Outage, ...]:
 
 @dataclass(frozen=True)
 class Recording:
-    """One flight from where its motors first turn; arrays of T rows, SI units."""
+    """One flight from when its motors first turn; arrays of T rows, SI units."""
 
     policy: str
     config: Config
@@ -224,28 +224,28 @@ class Recording:
     velocity: np.ndarray  # (T, 3) [m/s]
     quaternion: np.ndarray  # (T, 4) body -> world (w, x, y, z), the follower's
     rates: np.ndarray  # (T, 3) [rad/s]
-    leader: np.ndarray  # (T, 3) command: roll, pitch [rad], vertical acceleration [m/s2]; NaN: no law in command
+    leader: np.ndarray  # (T, 3) command: roll, pitch [rad], vertical acceleration [m/s2]; NaN: not in command
     follower: np.ndarray  # (T, 3) likewise
-    observation: np.ndarray  # (T, 18) NaN where no law was in command
-    hidden: np.ndarray  # (T, H) state of the follower's GRU, likewise; H = 0: it has none
-    rotor_force: np.ndarray  # (T, 2, 4) [N]; of a log: what the thrust that was sent gives, without lag and cascade
+    observation: np.ndarray  # (T, 18) NaN where the controllers were not in command
+    hidden: np.ndarray  # (T, H) state of the follower's GRU, likewise; H = 0 without a GRU
+    rotor_force: np.ndarray  # (T, 2, 4) [N]; of a log: from the sent thrust, without motor lag and attitude control
     cg_offset: np.ndarray  # (T,) [m]; NaN where it was not measured
-    remarks: tuple[str, ...] = ()  # what a reader of the log should know, a line each
+    remarks: tuple[str, ...] = ()  # notes on the quality of the log, a line each
 
     @property
     def target(self) -> np.ndarray:
-        """(T, 3) the goal [m]; while the pair lands as it was before: one that sinks below the ground only steers."""
+        """(T, 3) the goal [m]; while landing the last one before, not the one that sinks below the ground."""
         rows = np.where([phase == State.LAND.value for phase in self.phase], 0, np.arange(len(self.phase)))
         return np.asarray(self.goal[np.maximum.accumulate(rows)])
 
     @property
     def guided_rows(self) -> int:
-        """How many rows there are until the laws last flew to the goal."""
+        """Number of rows up to the last one in FLY."""
         return 1 + max((row for row, phase in enumerate(self.phase) if phase == GUIDED), default=-1)
 
 
 def read_recording(path: Path, assumed: Config | None = None) -> Recording:
-    """The flight in the log `path`, of the rig `assumed` if it does not say. Raises InputError if there is none."""
+    """The flight in the log `path`, of the rig `assumed` if the log names none. Raises InputError if it holds none."""
     log = load(path, assumed)
     plant = log.config.plant
     rig = Rig.of_plant(plant)
@@ -301,7 +301,7 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
 
 
 def twin_of(recording: Recording) -> DroneKind:
-    """The twin's drones whose firmware has the force curve that flew. Raises InputError if both had different ones."""
+    """The twin's kind of drone with the force curve of the flight. Raises InputError if the drones' curves differed."""
     curve = one_curve(recording.setup.curves)
     if curve is None:
         named = ", ".join(f"{name} {own}" for name, own in zip(NAMES, recording.setup.curves, strict=True))
@@ -310,11 +310,10 @@ def twin_of(recording: Recording) -> DroneKind:
 
 
 def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
-    """The recorded setpoints through the physics of drones of `kind`, from rest where the recorded flight began.
+    """Open-loop simulation of the recorded setpoints, from rest at the recorded start, with drones of `kind`.
 
-    Without a `kind` they are those that the log tells of (`twin_of`). The loop is open: what both disagree on adds
-    up with time. The object's mass and the CG's motion, which no log knows, are those of a rehearsal
-    (`twin.conditions.Conditions.of`).
+    Without a `kind` it is that of the log (`twin_of`). Model errors accumulate with time. The object's mass and the
+    CG's motion are not logged; they are those of a rehearsal (`twin.conditions.Conditions.of`).
     """
     pair = pair_of(recording.config, kind or twin_of(recording), Surroundings(exact=True))
     for drone, gains in enumerate(recording.setup.gains):
@@ -342,6 +341,6 @@ def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
 
 
 def drone_state(state: PairState, number: int) -> DroneState:
-    """What a perfect estimator of drone `number` would report."""
+    """State that a perfect estimator of drone `number` would report."""
     pose, moving = (state.position[number], state.velocity[number]), (state.quaternion[number], state.rates[number])
     return DroneState(*pose, *moving, 0, float(state.battery[number]))

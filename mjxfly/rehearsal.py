@@ -1,8 +1,8 @@
-"""The twin as a process, and whether this computer keeps up with it.
+"""The twin as a process, and whether this computer is fast enough for it.
 
-The twin says 50 times a second how late it is. Where that comes late or not at all, by whichever of both processes, a
-rehearsal that goes wrong says nothing of links, parameters and laws: it ends with one sentence that says so. At its end
-the twin tells where the object is.
+The twin reports its lateness 50 times a second. If the reports or the twin are late, a failed rehearsal shows nothing
+about links, parameters and controllers; it ends with one sentence that says so. At its end the twin reports the
+object's place.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from mjxfly.process import Child
 from mjxfly.supervisor import Event, Fault
 
 BEAT = 0.02  # [s] between two lines of the twin
-LATE = 0.04  # [s] of such a line, from where on it may be why something went wrong: a drone is lost after 0.1 s
-WINDOW = 3.0  # [s] for which it counts
-LAST = 5.0  # [s] that the twin flies on once it is left, until its motors are off
+LATE = 0.04  # [s] lateness that may explain a fault: a drone counts as lost after 0.1 s
+WINDOW = 3.0  # [s] for which lateness counts
+LAST = 5.0  # [s] that the twin flies on after its input is closed, until its motors are off
 
 
 class RehearsalError(InputError):
-    """A rehearsal that shows nothing of the flight: this computer cannot keep up with it, or its twin has failed."""
+    """A rehearsal is not valid: this computer is too slow for it, or its twin has failed."""
 
 
 class Rehearsal(Child):
     """A running twin. A context manager."""
 
     def __init__(self, flags: Sequence[str]):
-        """Start it with `flags` and this process's clock. Raises InputError."""
+        """Start the twin with `flags` and this process's clock. Raises InputError."""
         failure = "the twin did not start; are the ports of --leader and --follower free?"
         command = ["mjxfly.twin", f"--slow={clock.factor()}", *flags]
         super().__init__(command, failure, late=clock.too_slow("the twin was not ready within 30 s"))
@@ -42,8 +42,8 @@ class Rehearsal(Child):
         self.uris: tuple[str, str] = tuple(parse_json(self.line)["uris"])
         self._pipe = self._process.stdout.fileno()
         self._lateness: collections.deque[tuple[float, float]] = collections.deque()  # time and lateness [s]
-        self._newest = clock.now()  # when the newest line was written [s]
-        self._report: dict[str, Any] = {}  # its last line
+        self._newest = clock.now()  # time of the newest line [s]
+        self._report: dict[str, Any] = {}  # the twin's last line
         self._ended = threading.Event()
         threading.Thread(target=self._listen, name="rehearsal", daemon=True).start()
 
@@ -58,24 +58,24 @@ class Rehearsal(Child):
 
     def _take(self, line: bytes) -> None:
         try:
-            told = parse_json(line)
-        except ValueError:  # the rest of one that was read with the first
+            message = parse_json(line)
+        except ValueError:  # rest of a line that was partly read with the first
             return
-        if "behind" not in told:
-            self._report = told
+        if "behind" not in message:
+            self._report = message
             return
-        written, now = told["at"], clock.now()
-        self._lateness.append((now, max(told["behind"], now - written, written - self._newest - BEAT)))
+        written, now = message["at"], clock.now()
+        self._lateness.append((now, max(message["behind"], now - written, written - self._newest - BEAT)))
         self._newest = written
         while self._lateness[0][0] < now - WINDOW:
             self._lateness.popleft()
 
     def late(self) -> float:
-        """How late the twin, or what it says, has been of late [s]."""
+        """Largest lateness of the twin or of its reports within `WINDOW` [s]."""
         return max([clock.now() - self._newest - BEAT, *(late for _, late in list(self._lateness))])
 
     def excuse(self, cause: Fault | None = None) -> RehearsalError | None:
-        """What is to be said instead of what went wrong, such as a fault, if that may be the rehearsal's own doing."""
+        """Error that replaces a fault `cause`, or a failure, if a slow or failed twin may have caused it; else None."""
         if cause is not None and cause.event in (Event.KEY_KILL, Event.INTERRUPT):
             return None
         if cause is not None and cause.event is Event.DEADLINES:
@@ -87,7 +87,7 @@ class Rehearsal(Child):
         return RehearsalError(clock.too_slow(f"the twin is up to {late:.2f} s behind")) if late > LATE else None
 
     def end(self) -> str:
-        """Leave the twin; where the object is once its motors are off, and which faults never came, in a line each."""
+        """Let the twin end; lines on where the object is with its motors off, and on faults never injected."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -102,6 +102,6 @@ class Rehearsal(Child):
         return f"twin: {place}, motors {motors}; the twin was at most {late:.0f} ms behind{never}"
 
     def close(self) -> None:
-        """End it, at once."""
+        """Kill the twin."""
         self._process.kill()
         super().close()

@@ -1,4 +1,4 @@
-"""A flight from the first connection to the last line of the log: where threads, clocks and printing come together."""
+"""A flight from the first connection to the last line of the log: combines threads, clocks and printing."""
 
 from __future__ import annotations
 
@@ -38,34 +38,34 @@ from mjxfly.twin.drone import only_kept
 from mjxfly.warm_up import warm_up
 from mjxfly.watchdog import NOTHING, Watchdog
 
-SAVING = 0.2  # [s] for the log of a program that failed in the air: its radio is wanted
-SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
+SAVE_TIME = 0.2  # [s] to save the log of a program that failed in the air: the watchdog needs its radio
+SWITCH_INTERVAL = 5e-4  # [s] between switches of Python threads; the default of 5 ms is half a tick
 
 
 @dataclass(frozen=True)
 class FlightSetup:
-    """Who flies, and what with."""
+    """Controllers, drones and equipment of a flight."""
 
     controller: Controller
     variants: Sequence[Variants]  # of leader and follower
-    curve: CurveName  # that the firmwares are taken to have until their motors turn
+    curve: CurveName  # assumed for both firmwares until their motors turn
     rig: Rig
     preflight: Preflight
-    mocap: Mocap | None = None  # ready; the caller ends it
-    apps: Apps | None = None  # on board, if the laws are to run there
-    rehearsal: Rehearsal | None = None  # the twin that is flown; the caller ends it
+    mocap: Mocap | None = None  # ready; the caller closes it
+    apps: Apps | None = None  # if the controllers run on board
+    rehearsal: Rehearsal | None = None  # the twin; the caller closes it
 
     def excuse(self, cause: Fault | None = None) -> RehearsalError | None:
-        """What is to be said instead of what went wrong, if it is a rehearsal and that may be this computer's."""
+        """`Rehearsal.excuse` in a rehearsal, else None."""
         return None if self.rehearsal is None else self.rehearsal.excuse(cause)
 
 
 def fly(
     uris: Sequence[str], setup: FlightSetup, settings: FlightSettings, log: Path | None, command: Sequence[str] = ()
 ) -> int:
-    """Fly once; 0 if nothing went wrong, 1 after a fault. Raises InputError if a drone cannot be had.
+    """Fly once; return 0 without faults, 1 after a fault. Raises InputError if the flight cannot begin.
 
-    Prints the checks and how it ended. `command` goes into the log's header.
+    Prints the checks and the report at the end. `command`, the command line, goes into the log's header.
     """
     policy, gains = setup.controller.policy, [own[setup.curve].gains for own in setup.variants]
     header: dict[str, Any] = {"command": list(command), "version": __version__, "uris": list(uris)}
@@ -87,7 +87,7 @@ def fly(
         ]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
-            # Apps land by themselves: nobody else must take their place.
+            # Apps land by themselves: no watchdog may take over from them.
             alone = setup.apps is not None
             guard = contextlib.nullcontext() if alone else Watchdog(uris, rehearses=setup.rehearsal is not None)
             with urgent() as priority, guard as watchdog:
@@ -110,7 +110,7 @@ def fly(
                 flight.refusal = "" if flight.ready else "see the checks"
                 timing = run(flight, journal.close)
                 return _ended(flight, timing, journal, setup)
-        except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
+        except KeyboardInterrupt:  # before take-off; `run` handles Ctrl-C afterwards
             journal.note("refused", text="interrupted")
             _say("interrupted before take-off")
             return 1
@@ -127,9 +127,9 @@ def fly(
 
 
 def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
-    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Raises RehearsalError alone.
+    """Run the control loop until the flight is done, with Ctrl-C, SIGTERM and keys. Raises RehearsalError only.
 
-    An error of the program in the air ends the process after `save`, see `_leave`; on the ground it stops the motors.
+    A program error in the air ends the process after `save`, see `_leave`; on the ground it stops the motors.
     """
     metronome = Metronome(flight.settings.period)
 
@@ -154,7 +154,7 @@ def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
                 going = flight.tick(now, metronome.lateness, metronome.missed_lately(now), metronome.gap)
         except RehearsalError:
             raise
-        except BaseException as error:  # nothing in here may leave thrust on, or let a pair fall that flies
+        except BaseException as error:  # no error may leave the motors on, or stop them in flight
             with contextlib.suppress(Exception):
                 flight.note("error", text=f"{type(error).__name__}: {error}")
             if flight.flying:
@@ -164,16 +164,16 @@ def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
 
 
 def _leave(flight: Flight, error: BaseException, save: Callable[[], None], restore: Callable[[], None]) -> NoReturn:
-    """End as a killed runner does, without a word to the drones: zeros from here would turn the motors off.
+    """End the process without sending anything to the drones: zero setpoints would turn the motors off in the air.
 
-    The watchdog, or the apps on board, bring both down level. The log is saved and the terminal restored meanwhile.
+    The watchdog, or the apps on board, bring both drones down. The log is saved and the terminal restored meanwhile.
     """
     try:
         others = "the apps on board land both drones"
         if flight.watchdog is not None:
             flight.watchdog.leave()
             others = "the watchdog brings both drones down"
-        bounded(save, SAVING)
+        bounded(save, SAVE_TIME)
         restore()
         terminal.warn(f"error: the flight program failed in the air, {others}: {type(error).__name__}: {error}")
     finally:
@@ -181,11 +181,11 @@ def _leave(flight: Flight, error: BaseException, save: Callable[[], None], resto
 
 
 def _emergency(flight: Flight) -> None:
-    """The program failed on the ground: stop both drones without the flight's help."""
+    """After a program error on the ground: stop both drones without `Flight.tick`."""
     flight.kill = True
     for _ in range(50):
         if flight.watchdog is not None:
-            flight.watchdog.beat(False, NOTHING)  # it has nothing to take over any more
+            flight.watchdog.beat(False, NOTHING)  # so that it does not take over
         for link in flight.links:
             link.command(packets.EMERGENCY_STOP)
             link.send(packets.setpoint_packet(packets.ZERO))
@@ -217,19 +217,19 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
     code = 0 if cause is None and not stayed else 1
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
     figures = flight.flown.figures
-    why, told = str(cause) if cause else "", flight.how_it_ended()
+    why, sentences = str(cause) if cause else "", flight.how_it_ended()
     journal.note(
         "end",
         code=code,
         cause=why,
-        told=told,
+        told=sentences,
         timing=timing,
         overwritten=sent,
         flown=None if figures is None else dataclasses.asdict(figures),
     )
     if stayed and cause is None and (reason := setup.excuse()):
         raise reason
-    for text in told:
+    for text in sentences:
         _say(text)
     if cause is None and stayed:
         _say("it did not lift: is it heavier than its plant, or does a propeller give less?")

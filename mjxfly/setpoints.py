@@ -1,8 +1,8 @@
-"""What drones are sent: from a law's command to thrust units, and level flight where no law is in command.
+"""Setpoints: from a controller's command to thrust units, and level flight while no controller is in command. Pure.
 
 Firmware with battery compensation (2025.12.1 and later by default) makes the force proportional to the thrust command:
-`linear`. Firmware without it takes the command as the motors' PWM: `older`. No parameter says which, but the PWM does
-that the firmware makes of a small thrust: `preflight.SpinCheck` looks at it. Pure.
+curve `linear`. Firmware without it uses the command as the motors' PWM: curve `older`. No parameter tells which;
+`preflight.SpinCheck` recognises it by the PWM at a small thrust.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ GRAVITY = 9.81
 BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
 BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
 BLIND_LIMIT = 2.5  # [s] that it lasts at most
-MOST_TRIM = 1.15  # of what should hover, in any thrust that is taken for the one that does
-BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
-UNEVEN = 1.5  # [m/s2] likewise of the one that hears, measured: the stick bears the moment of so much less thrust
-STAND_BY = 0.4  # [s] before the firmware stops a drone by which the pair is to stand
+MOST_TRIM = 1.15  # largest trim over nominal hover thrust
+BRISK, GENTLE = 3.0, 0.7  # [m/s2] largest downward acceleration: if both drones hear, and if one may not
+UNEVEN = 1.5  # [m/s2] the same with a measured height: the stick bears the moment of the uneven thrust
+STAND_BY = 0.4  # [s] before the firmware stops a drone by which the pair should have landed
 NEAR_GROUND = 0.04  # [m]
-HELD_SPEEDS = (0.2, 1.2)  # [m/s] least and most of a descent that has to end in time
+HELD_SPEEDS = (0.2, 1.2)  # [m/s] bounds of the speed of a descent with a deadline
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ OLDER = ForceCurve(*motors.OLDER)  # firmware without battery compensation, 2.1 
 
 @dataclass(frozen=True)
 class CommandMap:
-    """How a drone's command becomes thrust units, and the bounds of every setpoint.
+    """Map from a drone's command to thrust units, and bounds of every setpoint.
 
     `paper`: thrust = thr_hov + k_pz az (the paper's experiment). `calibrated`: the force curve at the carried
     mass, T = m (g + az) / (cos roll cos pitch), as in simulation.
     """
 
     law: Literal["paper", "calibrated"] = "calibrated"
-    hover: float = 46000.0  # thr_hov [thrust units], of the paper; calibrate it for every rig
+    hover: float = 46000.0  # thr_hov [thrust units], of the paper; calibrate it for each rig
     per_acceleration: float = 1000.0  # k_pz [thrust units per m/s2], of the paper
     carried_mass: float = 0.035  # the drone and its share of the object [kg]
     gravity: float = GRAVITY  # [m/s2]
@@ -77,13 +77,13 @@ class CommandMap:
         return self.hover if self.law == "paper" else self.curve.thrust(self.carried_mass * self.gravity)
 
     def scaled(self, share: float) -> CommandMap:
-        """The map of a drone that hovers at `share` of the force that this one takes it to need."""
+        """The map of a drone whose hover force is `share` times that of this map."""
         hover, mass = share * self.hover, share * self.carried_mass
         return replace(self, hover=hover, per_acceleration=share * self.per_acceleration, carried_mass=mass)
 
 
 class Variant(NamedTuple):
-    """How one drone is flown if its firmware has a certain force curve."""
+    """Command map and gains of one drone for one force curve of its firmware."""
 
     map: CommandMap
     gains: Gains
@@ -93,7 +93,7 @@ Variants = Mapping[CurveName, Variant]  # of one drone, by the curve of its firm
 
 
 class Mapped(NamedTuple):
-    """A setpoint, and whether its thrust was cut at a bound."""
+    """A setpoint, and whether its thrust was clipped."""
 
     setpoint: Setpoint
     saturated: bool
@@ -109,7 +109,7 @@ def raw_thrust(command: Array, constants: CommandMap) -> float:
 
 
 def to_setpoint(command: Array, constants: CommandMap) -> Mapped:
-    """The bounded setpoint of `command` (3,), without yaw. Raises packets.PacketError if a number is not finite."""
+    """The bounded setpoint of `command` (3,), yaw rate 0. Raises packets.PacketError if a value is not finite."""
     roll, pitch, vertical = (float(value) for value in command)
     if not all(map(math.isfinite, (roll, pitch, vertical))):
         raise PacketError("a command is not finite")
@@ -121,28 +121,28 @@ def to_setpoint(command: Array, constants: CommandMap) -> Mapped:
 
 
 def level(thrust: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Setpoint:
-    """`tilt` (roll, pitch) [rad], level if not given, at `thrust`, within bounds."""
+    """Setpoint with `tilt` (roll, pitch) [rad] and `thrust` [units], clipped to its bounds."""
     bounded = min(max(thrust, THRUST_FLOOR), THRUST_CEILING) if math.isfinite(thrust) else THRUST_FLOOR
     return setpoint(*tilt, 0.0, bounded)
 
 
 def ramp(elapsed: float, times: Times, constants: CommandMap) -> Setpoint:
-    """Level, thrust rising in a straight line to hover."""
+    """Level setpoint `elapsed` [s] into the ramp, with thrust that rises linearly to hover."""
     share = min(elapsed / times.ramp, 1.0)
     return level(THRUST_FLOOR + share * (constants.hover_thrust - THRUST_FLOOR))
 
 
 def sinking_share(climb: float, times: Times) -> float:
-    """Share of the thrust that hovers by which a drone of vertical speed `climb` [m/s] comes to sink as wanted."""
+    """Thrust over trim that brings a drone with vertical speed `climb` [m/s] to `times.descend_speed` downward."""
     return 1 + min(max(-0.4 * (climb + times.descend_speed), -0.3), 0.1)
 
 
 def timed_share(height: float, climb: float, left: float) -> float:
-    """Share of the trim by which a pair `height` [m] up, of vertical speed `climb` [m/s], stands in time.
+    """Thrust over trim that lands a pair at `height` [m] with vertical speed `climb` [m/s] before `left` seconds pass.
 
-    In `left` seconds a drone that hears nothing, and holds its last thrust until then, is stopped by its firmware. What
-    is measured steers the descent, so that it is the same whether one drone obeys or both. Near the ground nothing is
-    braked: a pair that bounces may be in the air when it is stopped.
+    Then the firmware stops a drone that hears nothing and holds its last thrust. The descent is controlled by measured
+    height and speed, so that it is the same whether one drone obeys or both. Near the ground it is not slowed: a pair
+    that bounces may be in the air when a drone is stopped.
     """
     least, most = HELD_SPEEDS
     wanted = -min(max(height / max(left - STAND_BY, 0.2), least), most)
@@ -151,35 +151,35 @@ def timed_share(height: float, climb: float, left: float) -> float:
 
 
 def brake(velocity: np.ndarray) -> tuple[float, float]:
-    """(roll, pitch) [rad] that brake a horizontal `velocity` (3,) [m/s] with a time constant of 0.7 s."""
+    """(roll, pitch) [rad] that brake the horizontal part of `velocity` (3,) [m/s] with a time constant of 0.7 s."""
     wanted = leader.command(-velocity / 0.7, 0.0, GRAVITY, BRAKE_TILT, 1.0)
     roll, pitch = float(wanted[0]), float(wanted[1])
     return (roll, pitch) if math.isfinite(roll) and math.isfinite(pitch) else (0.0, 0.0)
 
 
 def smoothed(trim: float, thrust: float, period: float, hover: float) -> float:
-    """Running average over a second of the thrust that hovers, no further than 15 % from what the rig should need.
+    """New hover thrust `trim`: running average of `thrust` over 1 s, within 15 % of the nominal `hover` [units].
 
-    A climb that has just begun must not pass for hovering: the bound keeps what is flown blind near the truth.
+    The bound keeps a climb that has just begun from being taken for hover in a later blind descent.
     """
     moved = trim - math.expm1(-period) * (thrust - trim)
     return min(max(moved, 0.85 * hover), MOST_TRIM * hover)
 
 
 class LastKnownState(NamedTuple):
-    """What is known of the pair at the moment when nothing more will be heard of it."""
+    """State of the pair from which a blind descent begins."""
 
-    trims: tuple[int, int]  # thrust that hovers, leader and follower [thrust units]
+    trims: tuple[int, int]  # hover thrust of leader and follower [thrust units]
     height: float  # of O above where it stood [m]
-    climb: float  # its vertical speed [m/s]
-    lift: float  # its vertical acceleration under the setpoints that were sent last [m/s2]
+    climb: float  # vertical speed of O [m/s]
+    lift: float  # vertical acceleration under the last setpoints [m/s2]
 
 
 def blind_shares(seen: LastKnownState, unheard: float, period: float, hardest: float = BRISK) -> list[float]:
-    """Shares of the trim for a descent that is flown blind, one per `period` [s], all below 1.
+    """Thrust over trim of a blind descent, one value per `period` [s], all below 1.
 
-    The first `unheard` seconds went by under the last setpoints. From there the pair's height is computed, not
-    measured: sink at `BLIND_SPEED`, gained with at most `hardest` [m/s2], until it must stand, and 0.1 s more.
+    The last setpoints were in force for the first `unheard` seconds. From then on height and speed are predicted, not
+    measured: sink at `BLIND_SPEED`, reached with at most `hardest` [m/s2], until the ground, and 0.1 s more.
     """
     height, climb, lift = (value if math.isfinite(value) else 0.0 for value in seen[1:])
     lift = min(max(lift, -3.0), 3.0)

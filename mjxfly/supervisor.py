@@ -1,6 +1,6 @@
-"""The safety supervisor: a pure state machine. `TRANSITIONS` is all of it; docs/supervisor.md shows it as a table.
+"""The safety supervisor: a pure state machine. `TRANSITIONS` defines it; docs/supervisor.md shows it as a table.
 
-States say what both drones are sent, and always both: any fault on one of them brings both down together.
+A state determines what is sent to both drones. A fault of one drone always brings both down together.
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ from typing import NamedTuple
 
 
 class State(Enum):
-    """What both drones are sent."""
+    """State of the flight, by what is sent to both drones."""
 
-    CHECK = "check"  # zeros, while the checks before flight run
+    CHECK = "check"  # zeros, during the preflight checks
     ARM = "arm"  # zeros, which open the firmware's thrust lock while it arms
-    SPIN = "spin"  # level, a third of hover: what the motors get shows which force curve the firmware has
+    SPIN = "spin"  # level, a third of hover thrust: the motors' PWM shows the firmware's force curve
     RAMP = "ramp"  # level, thrust rising until the pair is off the ground
     FLY = "fly"  # leader PID and follower policy
-    LAND = "land"  # the same laws toward a goal that sinks
-    DESCEND = "descend"  # level, thrust held to a sinking speed where it is known, else ramped down
-    HOLD = "hold"  # a drone is not heard: level, a little less than the trims, until its own watchdog must stop it
+    LAND = "land"  # the same controllers with a goal that sinks
+    DESCEND = "descend"  # level, thrust controls the sink rate if it is known, else follows a plan
+    HOLD = "hold"  # a drone is not heard: level, a little below hover thrust, until its firmware stops it
     STOP = "stop"  # stop and zero setpoints, until the firmware counts neither drone as flying
     KILL = "kill"  # emergency stop, repeated; the firmware stays locked until reboot
     DONE = "done"  # motors off, disarmed; nothing more is sent
 
     @property
     def severity(self) -> int:
-        """Order of precedence when one tick has several events; only HOLD leads back to what it interrupted."""
+        """Precedence if one tick has several events. Only HOLD can lead back, to the state that it interrupted."""
         return list(State).index(self)
 
 
 class Event(Enum):
-    """What may happen."""
+    """Input of the state machine; values are descriptions."""
 
     READY = "all checks before flight passed"
     REFUSED = "a check before flight failed"
@@ -72,7 +72,7 @@ class Event(Enum):
 
 
 class Fault(NamedTuple):
-    """An event with what is known about it."""
+    """An event with details."""
 
     event: Event
     detail: str = ""
@@ -84,12 +84,12 @@ class Fault(NamedTuple):
 S, E = State, Event
 BEFORE_MOTORS = (S.CHECK, S.ARM)
 ON_GROUND = (*BEFORE_MOTORS, S.SPIN)
-GUIDED = (S.FLY, S.LAND)  # leader and follower laws are in command
+GUIDED = (S.FLY, S.LAND)  # leader and follower controllers are in command
 AIRBORNE = (S.RAMP, S.FLY, S.LAND, S.DESCEND, S.HOLD)
 ENDED = (S.STOP, S.KILL, S.DONE)
 
 
-# What goes as planned; and after what the pair sinks under control.
+# Events of a normal flight; and faults after which the pair descends under control.
 PLANNED = frozenset({E.READY, E.ARMED, E.CURVE_KNOWN, E.HOVERING, E.TIME_UP, E.RESUMED, E.TOUCHED_DOWN, E.GROUNDED})
 _CONTROLLED = (
     *(E.BAD_STATE, E.FENCE, E.LIFT, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.FRAME, E.APP_DESCENDS, E.POSE),
@@ -97,7 +97,7 @@ _CONTROLLED = (
 
 
 def _planned() -> dict[tuple[State, Event], State]:
-    """A flight in which nothing is wrong, and who may end it early."""
+    """Transitions of a normal flight, with those on request."""
     return {
         (S.CHECK, E.READY): S.ARM,
         (S.ARM, E.ARMED): S.SPIN,
@@ -109,7 +109,7 @@ def _planned() -> dict[tuple[State, Event], State]:
         (S.RAMP, E.INTERRUPT): S.DESCEND,
         (S.LAND, E.TOUCHED_DOWN): S.STOP,
         (S.DESCEND, E.TOUCHED_DOWN): S.STOP,
-        (S.HOLD, E.RESUMED): S.FLY,  # or what else was interrupted, see `Supervisor.after`
+        (S.HOLD, E.RESUMED): S.FLY,  # or another state that was interrupted, see `Supervisor._resumed`
         (S.STOP, E.GROUNDED): S.DONE,
         (S.STOP, E.TIMEOUT): S.DONE,
         (S.KILL, E.TIMEOUT): S.DONE,
@@ -117,14 +117,14 @@ def _planned() -> dict[tuple[State, Event], State]:
 
 
 def _on_the_ground() -> dict[tuple[State, Event], State]:
-    """Before the pair can lift, whatever is wrong ends it."""
+    """Before the pair can lift, any fault stops the motors."""
     harmless = PLANNED | {E.SATURATED, E.DEADLINES, E.TIMEOUT, E.INTERRUPT}
     wrong = {(state, event): S.STOP for state in ON_GROUND for event in E if event not in harmless}
     return wrong | {(state, event): S.STOP for state in ON_GROUND for event in (E.TIMEOUT, E.INTERRUPT)}
 
 
 def _in_the_air() -> dict[tuple[State, Event], State]:
-    """What can still be flown lands or sinks level, what cannot be heard is mirrored, what is lost is cut."""
+    """In the air: land or descend under control, hold if a drone is not heard, stop if one cannot be controlled."""
     table = {(S.FLY, event): S.LAND for event in (E.BATTERY, E.WATCHDOG, E.GAPS)}
     table |= {(S.RAMP, event): S.DESCEND for event in (E.BATTERY, E.WATCHDOG, E.GAPS, E.TIMEOUT)}
     table[S.LAND, E.TIMEOUT] = S.DESCEND
@@ -140,31 +140,31 @@ def _in_the_air() -> dict[tuple[State, Event], State]:
 
 
 def _table() -> dict[tuple[State, Event], State]:
-    """Every pair that changes the state; all others keep it. A kill is possible until everything is over."""
+    """All transitions; other pairs keep the state. The kill key works in every state but DONE."""
     kill = {(state, E.KEY_KILL): S.KILL for state in S if state is not S.DONE}
     return _planned() | _on_the_ground() | _in_the_air() | kill
 
 
 TRANSITIONS = {pair: state for pair, state in _table().items() if pair[0] is not state}
-SHORT = (S.ARM, S.SPIN, S.RAMP)  # states whose time limit is only reached if something is wrong
+SHORT = (S.ARM, S.SPIN, S.RAMP)  # states whose timeout is a fault
 # The flight's exit code is 1 after any of these, or after a state of SHORT that lasted too long.
 FAULTS = frozenset(E) - PLANNED - {E.INTERRUPT, E.TIMEOUT}
 
 
 @dataclass(frozen=True)
 class Supervisor:
-    """State and when it was entered. Immutable: `after` returns the next one."""
+    """State machine: state, time of entry, cause of an abort. Immutable: `after` returns the next one."""
 
     state: State = State.CHECK
     since: float = 0.0  # [s]
-    cause: Fault | None = None  # what began the abort
-    held: tuple[State, float] | None = None  # the state that HOLD interrupted, and when that was entered [s]
+    cause: Fault | None = None  # first fault of an abort
+    held: tuple[State, float] | None = None  # state that HOLD interrupted, and its time of entry [s]
 
     def after(self, faults: list[Fault], now: float) -> Supervisor:
-        """The supervisor after everything that happened in one tick ending at `now` [s]."""
+        """The supervisor after the `faults` of one tick at `now` [s]."""
         known = [fault for fault in faults if (self.state, fault.event) in TRANSITIONS]
         led = [(TRANSITIONS[self.state, fault.event], fault) for fault in known]
-        # Whoever pressed the kill key wants nothing else.
+        # The kill key overrides all other events.
         asked = [pair for pair in led if pair[1].event is Event.KEY_KILL]
         best, why = max(asked or led, key=lambda pair: pair[0].severity, default=(self.state, None))
         if why is None:
@@ -178,7 +178,7 @@ class Supervisor:
 
     @property
     def may_resume(self) -> bool:
-        """True in a hold that a gap in the states or in what a drone hears began while the laws were in command."""
+        """True in HOLD if it began with a gap in states or uplink while the controllers were in command."""
         guided = self.held is not None and self.held[0] in GUIDED
         return guided and self._gap
 
@@ -187,7 +187,7 @@ class Supervisor:
         return self.cause is not None and self.cause.event in (Event.STALE, Event.UNHEARD)
 
     def _resumed(self, now: float) -> Supervisor:
-        """Back to what HOLD interrupted; a gap that closed is no cause. A ramp is not taken up again."""
+        """Back to the state that HOLD interrupted, with no cause if it was a gap; to DESCEND if it was the ramp."""
         state, since = self.held or (State.DESCEND, now)
         cause = None if self._gap else self.cause
         return Supervisor(state, since, cause) if state in GUIDED else Supervisor(State.DESCEND, now, self.cause)

@@ -1,12 +1,12 @@
-"""Off the ground: thrust rises until the legs carry nothing, and the stick is held level, before any law takes over.
+"""Take-off: thrust rises until the pair is off the ground, with the stick held level, before the controllers take over.
 
-Legs hide the load from the laws: a side that stands answers no command, and what a follower remembers of that is wrong
-in the air. With the load off the middle the light side comes up first. What the drones lift apart is therefore found
-here, while the thrust still rises, by the stick's own angle. Pure.
+On the ground the legs carry part of the load: a side that stands does not respond to commands, and a recurrent follower
+would remember that. With an off-centre load the lighter side lifts first. The difference between the drones' thrusts is
+therefore found here, by feedback of the stick's angle, while the thrust rises. Pure.
 
-What holds the stick level at the end of the ramp is what hovers, whether the load lies to one side or one drone's
-motors give less than the other's. The laws go on from there (`TakeOff.needed`): else the stick tips as soon as they
-take over, and slides until the drones' integrals have made up for it.
+The thrusts that hold the stick level at the end of the ramp are those of hover, whether the load is off-centre or one
+drone has weaker motors. The controllers start from them (`TakeOff.needed`). Otherwise the stick would tip when they
+take over, and the pair would drift until their integrals have compensated.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from mjxfly.packets import THRUST_CEILING, Setpoint
 from mjxfly.setpoints import CommandMap
 from mjxfly.telemetry import ObjectState, Rig
 
-BEGIN = 0.85  # of the ramp, at 88 % of hover: a side that the load is not on comes off at 96 %
-MOST_LIFT = 1.25  # share of hover that is tried: a rig that needs more is not the one that the policy was trained for
-CLIMB = 0.1  # [m/s] upward that is held
-CLIMB_GAIN = 0.4  # share of hover per m/s that is missing
-CLIMB_INTEGRAL = 1.5  # likewise per m: a pair that stands gets 15 % of hover more a second
-# Shares of hover that the drones lift apart, per rad, rad/s and rad s of the stick. At 50 ms of motor lag and 40 ms of
-# delay the stick settles within half a second; twice these gains let it swing.
+BEGIN = 0.85  # fraction of the ramp at which feedback starts, at 88 % of hover: an unloaded side lifts at 96 %
+MOST_LIFT = 1.25  # largest thrust over hover: a rig that needs more is not the one that the policy was trained for
+CLIMB = 0.1  # [m/s] climb rate that is controlled
+CLIMB_GAIN = 0.4  # thrust over hover per m/s of error
+CLIMB_INTEGRAL = 1.5  # the same per m: a pair that stands gets 15 % of hover more per second
+# Opposite corrections of the drones' thrusts over hover, per rad, rad/s and rad s of the stick. With 50 ms of motor lag
+# and 40 ms of delay the stick settles within half a second; with twice these gains it oscillates.
 LEVEL_GAIN, LEVEL_DAMPING, LEVEL_INTEGRAL = 2.5, 0.35, 15.0
 STUCK = "the pair is not seen to leave the ground"
-LOAD = 0.03  # share of hover that a load of 20 g, 2 cm beside the middle, has the drones lift apart
-DISAGREEING = 1.5  # the same per rad by which the drones' attitudes disagree along the stick: 0.7 - 1.3 on the twin
-APART = 0.15  # share of hover that the drones lift apart at most
+LOAD = 0.03  # this correction for a load of 20 g, 2 cm off the middle
+DISAGREEING = 1.5  # the same per rad between the drones' attitudes along the stick: 0.7 - 1.3 on the twin
+APART = 0.15  # largest correction
 
 
 def _clip(value: float, most: float) -> float:
@@ -45,19 +45,19 @@ class TakeOff:
     """Setpoints of the ramp. `wanted` is called once per period."""
 
     def __init__(self, rig: Rig, times: Times, period: float, lifted_at: float, stand: bool):
-        """`period` [s]; off the ground from `lifted_at` [m] on; on a `stand` nothing brakes sideways."""
+        """`period` [s] of the loop; airborne from height `lifted_at` [m] on; no sideways braking on a `stand`."""
         level = rig.span * [1.0, 1.0, 0.0]
         self._along = level / np.linalg.norm(level)  # from follower to leader, body axes
         self._times, self._period, self._lifted_at, self._stand = times, period, max(lifted_at, 1e-3), stand
         self._share = self._apart = self._resting = 0.0
-        self.sent = [0.0, 0.0]  # thrust of leader and follower, last [units]
+        self.sent = [0.0, 0.0]  # last thrust of leader and follower [units]
 
     def wanted(self, elapsed: float, seen: ObjectState, height: float, maps: Sequence[CommandMap]) -> list[Setpoint]:
-        """Both setpoints `elapsed` [s] into the ramp, with O `height` [m] above where it stood."""
+        """Setpoints of leader and follower `elapsed` [s] into the ramp, with O at `height` [m] above its start."""
         angle = self._angle(seen.matrix)
         tilt = (0.0, 0.0)
         if elapsed < BEGIN * self._times.ramp:
-            # The floor need not be level.
+            # Open loop. The stick's angle on the ground is recorded, since the floor need not be level.
             found = [setpoints.ramp(elapsed, self._times, constants) for constants in maps]
             self._share = found[0].thrust / maps[0].hover_thrust - CLIMB_GAIN * CLIMB
             self._apart, self._resting = 0.0, angle
@@ -70,11 +70,11 @@ class TakeOff:
         return found
 
     def _angle(self, matrix: np.ndarray) -> float:
-        """Of the stick above the horizon [rad]."""
+        """Elevation of the stick from follower to leader [rad], attitude `matrix` (3, 3) body -> world."""
         return math.asin(_clip(float((matrix @ self._along)[2]), 1.0))
 
     def _shares(self, angle: float, seen: ObjectState, height: float) -> tuple[float, float]:
-        """Shares of hover of leader and follower: a climb that is held, a stick that comes to be level."""
+        """Thrust over hover of leader and follower: controls the climb rate and brings the stick level."""
         missing = CLIMB - float(seen.velocity[2])
         self._share = min(max(self._share + CLIMB_INTEGRAL * self._period * missing, 0.0), MOST_LIFT)
         off = angle - self._resting * (1.0 - min(max(height / self._lifted_at, 0.0), 1.0))
@@ -85,17 +85,17 @@ class TakeOff:
         return both - apart, both + apart
 
     def needed(self, quaternions: Sequence[np.ndarray]) -> tuple[float, float]:
-        """Force of leader and follower that keeps the stick level, as shares of what should hover.
+        """Hover force of leader and follower over nominal, by the thrusts that keep the stick level.
 
-        Up to `LOAD` it may be the load's place, as the laws know it, and on a `stand` it is the ball's. Attitudes of
-        the drones that disagree, `quaternions` (2, 4), have each push its end to another place.
+        (1, 1) for a difference that an off-centre load explains, which the controllers can handle: up to `LOAD`, more
+        if the drones' attitudes `quaternions` (2, 4) disagree, and always on a stand, where it is the ball's.
         """
         angles = [self._angle(rotations.matrix_from_quaternion(one)) for one in quaternions]
         motors = abs(self._apart) > LOAD + DISAGREEING * abs(angles[0] - angles[1]) and not self._stand
         return (1.0 - self._apart, 1.0 + self._apart) if motors else (1.0, 1.0)
 
     def stuck(self, maps: Sequence[CommandMap]) -> str:
-        """What is seen of a pair that has not come off: which drone gives what, and at which bound."""
+        """Message on a pair that has not left the ground, with both drones' thrusts and their bounds."""
         found = []
         for name, thrust, constants in zip(NAMES, self.sent, maps, strict=True):
             share, bound = thrust / constants.hover_thrust, ""

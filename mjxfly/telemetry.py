@@ -1,4 +1,4 @@
-"""The pair's state: how old each drone's is, by arrival and by the firmware's clock, and the object's from both."""
+"""States of both drones with their ages, by arrival and by the firmware's clock; state of the object from both."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mjxball.control import rotations
 from mjxfly.app.protocol import AppSample
 from mjxfly.packets import DroneState, Health, Packet, Sensed
 
-Note = Callable[..., None]  # note(kind, t=None, **fields): into the flight log, without blocking
+Note = Callable[..., None]  # note(kind, t=None, **fields) adds a record to the flight log without blocking
 WRAP = 1 << 24  # [ms] the firmware's time stamps have 24 bits
 LONGEST_STEP = 10_000  # [ms] between two stamps; a larger one means that the drone was restarted
-DRIFT = 1e-4  # of the firmware's clock against ours
+DRIFT = 1e-4  # largest relative drift of the firmware's clock against ours
 
 
 class Sample(NamedTuple):
-    """One state as it arrived."""
+    """One received state."""
 
     state: DroneState
     arrival: float  # [s] of our monotonic clock
@@ -29,35 +29,35 @@ class Sample(NamedTuple):
 
 
 class HealthSample(NamedTuple):
-    """One health packet as it arrived."""
+    """One received health packet."""
 
     health: Health
     arrival: float  # [s] of our monotonic clock
 
 
 class SensedSample(NamedTuple):
-    """One packet of what a drone senses, as it arrived."""
+    """One received packet of sensed values."""
 
     sensed: Sensed
     stamp: int  # [ms] of the firmware's clock
 
 
 class FirmwareClock:
-    """Maps time stamps to our clock: the least delay ever seen counts as none.
+    """Maps time stamps to our clock, with the smallest delay so far taken as zero.
 
-    A packet that waited in a queue is then old by this clock although it has just arrived, and one that repeats an
-    old stamp grows old although packets keep coming.
+    The age of a packet then includes its time in queues, and repeated packets with an old stamp age although they keep
+    arriving.
     """
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._time = 0  # [ms] unwrapped
-        self._offset = math.inf  # [s] arrival less stamp
-        self._newest = 0.0  # [s] of our clock
+        self._offset = math.inf  # [s] arrival minus stamp
+        self._newest = 0.0  # [s] newest arrival, our clock
         self.restarted = False
 
     def update(self, stamp: int, arrival: float) -> float | None:
-        """Time of `stamp` [ms] in seconds, None if it is older than one already seen or its clock started anew."""
+        """Unwrapped time of `stamp` [ms] in seconds, None if it is older than an earlier one or the drone restarted."""
         if self._last is not None:
             step = (stamp - self._last + WRAP // 2) % WRAP - WRAP // 2
             self.restarted = self.restarted or abs(step) > LONGEST_STEP
@@ -71,18 +71,18 @@ class FirmwareClock:
         return seconds
 
     def seconds(self, stamp: int) -> float:
-        """Time of `stamp` [ms] in seconds, of a packet that came close to the newest state; NaN before that."""
+        """Unwrapped time of `stamp` [ms] in seconds, for a packet close to the newest state; NaN before the first."""
         if self._last is None:
             return math.nan
         return (self._time + (stamp - self._last + WRAP // 2) % WRAP - WRAP // 2) / 1000
 
     def age(self, seconds: float, now: float) -> float:
-        """Age [s] at `now` of what was stamped at `seconds` of the firmware."""
+        """Age [s] at `now` of a packet stamped at `seconds` of the firmware's clock."""
         return math.inf if self.restarted else now - (seconds + self._offset)
 
 
 class Telemetry:
-    """The newest state of one drone, and how many came."""
+    """Newest samples of one drone, and counts of its states."""
 
     def __init__(self) -> None:
         self.clock = FirmwareClock()
@@ -93,7 +93,7 @@ class Telemetry:
         self.received = self.damaged = self.late = 0
 
     def take(self, state: DroneState, stamp: int, arrival: float) -> bool:
-        """A state came with time stamp `stamp` [ms] at `arrival` [s]; false if a newer one came before."""
+        """Store a state stamped `stamp` [ms] that arrived at `arrival` [s]; false if it is older than the newest."""
         self.received += 1
         seconds = self.clock.update(stamp, arrival)
         if seconds is None:
@@ -103,7 +103,7 @@ class Telemetry:
         return True
 
     def age(self, now: float) -> float:
-        """The worse of both ages [s]; infinite before the first state."""
+        """Age of the newest state [s], the larger of both clocks'; infinite before the first one."""
         sample = self.newest
         if sample is None:
             return math.inf
@@ -111,28 +111,28 @@ class Telemetry:
 
 
 class DroneLink(Protocol):
-    """What a flight needs of `link.Link`. Nothing here blocks."""
+    """The part of `link.Link` that a flight uses. Nothing here blocks."""
 
     telemetry: Telemetry
-    lost: str | None
-    busy: bool | str  # with `write_later`: True while writing, else why it failed
+    lost: str | None  # why the link has ended
+    busy: bool | str  # of `write_later`: True while writing, a text if it failed
 
     def send(self, packet: Packet) -> None:
-        """Newest setpoint."""
+        """Send `packet` as the newest setpoint."""
 
     def command(self, packet: Packet) -> None:
-        """Before any setpoint."""
+        """Send `packet` ahead of setpoints."""
 
     def write_later(self, values: Mapping[str, float]) -> None:
         """Write firmware parameters; see `busy`."""
 
     def stuck_for(self, now: float) -> float:
-        """How long something has waited to be sent [s]."""
+        """Time for which waiting packets could not be sent [s]."""
         ...
 
 
 class ObjectState(NamedTuple):
-    """The assembly as the laws see it."""
+    """State of the assembly, as the controllers observe it."""
 
     position: np.ndarray  # (3,) of O in the world [m]
     velocity: np.ndarray  # (3,) [m/s]
@@ -147,14 +147,14 @@ class ObjectState(NamedTuple):
 
 @dataclass(frozen=True)
 class Rig:
-    """Where the drones sit on the object, from O in body axes [m]."""
+    """Mounting points of leader and follower relative to O, body axes [m]."""
 
     leader_mount: tuple[float, float, float]
     follower_mount: tuple[float, float, float]
 
     @classmethod
     def of_card(cls, card: Mapping[str, Any]) -> Rig:
-        """The rig that a policy was trained for."""
+        """The rig that a policy was trained for, from its metadata."""
         plant: Any = card["plant"]
         leader = int(plant.get("leader", 0))
         mounts = [tuple(drone["mount"]) for drone in plant["drones"]]
@@ -162,32 +162,32 @@ class Rig:
 
     @classmethod
     def of_plant(cls, plant: configs.Plant) -> Rig:
-        """That of a plant of two drones; InputError for any other."""
+        """The rig of a plant with two drones. Raises InputError for any other."""
         leader, follower = plant.pair
         return cls(leader.mount, follower.mount)
 
     @property
     def mounts(self) -> np.ndarray:
-        """(2, 3) of leader and follower from O [m]."""
+        """(2, 3) mounting points of leader and follower relative to O [m]."""
         return np.array([self.leader_mount, self.follower_mount])
 
     @property
     def span(self) -> np.ndarray:
-        """(3,) leader from follower [m]."""
+        """(3,) position of the leader relative to the follower [m]."""
         return np.array(self.leader_mount) - np.array(self.follower_mount)
 
     @property
     def weights(self) -> tuple[float, float]:
-        """Of leader and follower in O's position: where the mounts' weighted mean is O."""
+        """Weights of leader and follower by which the mean of their mounts is O."""
         ahead, behind = (float(np.linalg.norm(mount)) for mount in (self.leader_mount, self.follower_mount))
         return behind / (ahead + behind), ahead / (ahead + behind)
 
 
 def object_state(states: Sequence[DroneState], rig: Rig) -> ObjectState:
-    """O's state from both drones' (leader, follower).
+    """State of the object from both drones' `states` (leader, follower).
 
-    Position and velocity are the weighted means, which need no attitude and in which the two estimators' errors
-    average; attitude and rates are the follower's own, because its policy sees them (paper).
+    Position and velocity of O are weighted means, which need no attitude and average the two estimators' errors.
+    Attitude and rates are the follower's own, as its policy observes them (paper).
     """
     lead, follow = rig.weights
     position = lead * states[0].position + follow * states[1].position
@@ -196,7 +196,7 @@ def object_state(states: Sequence[DroneState], rig: Rig) -> ObjectState:
 
 
 def object_of_one(state: DroneState, mount: np.ndarray) -> ObjectState:
-    """O's state from one drone's alone: p_O = p - R r, with `mount` r (3,) [m]."""
+    """State of the object from one drone's: p_O = p - R r, with `mount` r (3,) [m]."""
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     position = state.position - matrix @ mount
     velocity = state.velocity - matrix @ np.cross(state.rates, mount)

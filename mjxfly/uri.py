@@ -1,7 +1,7 @@
-"""Which drone a link's URI names. Links are compared as parsed: one drone has many spellings. Pure but for host names.
+"""Parsing and comparing the URIs of links: one drone can be named in several ways. Resolves host names, else pure.
 
-The forms are those that cflib 0.1.34 takes (crtp/radiodriver.py, usbdriver.py, udpdriver.py), less what it takes for
-something else without a word: an unknown data rate, which is 2M to it.
+The forms are those of cflib 0.1.34 (crtp/radiodriver.py, usbdriver.py, udpdriver.py), except for unknown data rates,
+which cflib silently takes as 2M.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from mjxball.errors import InputError
 
 EXAMPLES = "radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850"
 HERE = "127.0.0.1"
-LAST_CHANNEL = 125  # of 1 MHz each, from 2400 MHz on: what a Crazyradio and a drone can be set to
-APART = 2  # channels that a link of 2 Mbit/s takes
+LAST_CHANNEL = 125  # of 1 MHz each, from 2400 MHz on: range of a Crazyradio and a drone
+APART = 2  # channels that a link of 2 Mbit/s occupies
 RATES = ("250K", "1M", "2M")
-ADDRESS = "E7E7E7E7E7"  # where a link names none
+ADDRESS = "E7E7E7E7E7"  # default if a URI names none
 RADIO = re.compile(
     r"radio://([0-9A-Za-z]+)/([0-9]{1,6})(?:/([^/?]+))?(?:/([0-9A-Fa-f]{1,10}))?/?(?:\?(\S*))?", re.ASCII
 )
 UDP = re.compile(r"udp://([\w.\-]+):([0-9]{1,5})")
 USB = re.compile(r"usb://([0-9]{1,4})")
-LIMITED = re.compile(r"(?:^|&)rate_limit=(?![1-9][0-9]*(?:&|$))")  # cflib takes whole numbers
+LIMITED = re.compile(r"(?:^|&)rate_limit=(?![1-9][0-9]*(?:&|$))")  # a value that is not a positive integer
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Radio:
 
     @property
     def drone(self) -> tuple[object, ...]:
-        """What two links to one drone have in common: any dongle reaches it."""
+        """Key that is equal for links to the same drone, which any dongle can reach."""
         return self.channel, self.rate, self.address
 
 
 @dataclass(frozen=True)
 class Udp:
-    """A drone that is a program."""
+    """A simulated drone on a UDP port."""
 
     host: str  # IPv4; any address of this machine's loopback is `HERE`
     port: int
@@ -58,7 +58,7 @@ class Udp:
 
 @dataclass(frozen=True)
 class Usb:
-    """A drone on a cable."""
+    """A drone on a USB cable."""
 
     number: int
 
@@ -105,13 +105,13 @@ def _host(name: str, where: str) -> str:
 
 
 def share_dongle(links: Sequence[Uri]) -> bool:
-    """Whether both links are of one radio dongle."""
+    """Whether both links use the same radio dongle."""
     one, other = links
     return isinstance(one, Radio) and isinstance(other, Radio) and one.dongle == other.dongle
 
 
 def check_pair(leader: Uri, follower: Uri, names: str = "--leader and --follower") -> None:
-    """Raise InputError for two links that are one, or that disturb each other; `names` are both drones'."""
+    """Raise InputError for links to the same drone or links that interfere; `names` name both in messages."""
     if type(leader) is type(follower) and leader.drone == follower.drone:
         raise InputError(f"{names} are the same drone; each needs a link of its own")
     if not isinstance(leader, Radio) or not isinstance(follower, Radio):

@@ -1,7 +1,7 @@
-"""A flight through every state before the first one begins: what it would do for the first time in the air is done.
+"""A flight through every state that sends nothing, before the real one, so that no code runs first in the air.
 
-The first call of a policy makes its matrices, a part of NumPy is loaded where it is first named, code is read from a
-disk that may be busy: the thread that flies stood for 30 ms where a machine was idle, and for seconds where it was not.
+First calls load parts of NumPy, read code from a disk that may be busy and prepare a policy's matrices. They stalled
+the control loop for 30 ms on an idle machine and for seconds on a busy one.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from mjxfly.supervisor import Event, Fault, State, Supervisor
 from mjxfly.telemetry import DroneLink, Rig, Telemetry
 
 TICKS = 6  # in each state: longer than a command lasts
-STEP = 1e-4  # [s] between two of them: what has been heard must stay fresh
+STEP = 1e-4  # [s] between two ticks, so short that the received states stay fresh
 
 
 class Deaf:
-    """A link over which nothing is sent, with what a real one has heard."""
+    """A link with the telemetry of a real one that sends nothing."""
 
     lost: str | None = None
     busy: bool | str = False
@@ -31,15 +31,15 @@ class Deaf:
         self.telemetry = telemetry
 
     def send(self, packet: Packet) -> None:
-        """Nothing goes out."""
+        """Drop `packet`."""
 
     command = send
 
     def write_later(self, values: Mapping[str, float]) -> None:
-        """Nothing is written."""
+        """Write nothing."""
 
     def stuck_for(self, now: float) -> float:
-        """Nothing waits."""
+        """0: nothing waits."""
         return 0.0
 
 
@@ -53,9 +53,9 @@ def warm_up(
     settings: FlightSettings,
     now: float,
 ) -> None:
-    """Fly `kind` on what `links` have heard by `now` [s], without a word to them, and forget it.
+    """Run a flight of class `kind` through all states on the telemetry of `links` at `now` [s], without sending.
 
-    What lives by then is left out of later searches for garbage.
+    Resets `controller` and exempts all live objects from later garbage collections.
     """
     deaf = [Deaf(link.telemetry) for link in links]
     flight = kind(deaf, controller, variants, assumed, rig, settings, lambda *_, **__: None)

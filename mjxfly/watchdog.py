@@ -1,9 +1,9 @@
-"""The watchdog: a process of its own that brings both drones down if the runner dies or hangs in the air.
+"""The watchdog: a separate process that brings both drones down if the runner dies or hangs in the air.
 
-The runner's main thread writes a frame with its time at every tick. A closed pipe is its death, a frame that is too old
-while flying a hang, whatever its other threads do: it is then killed, so that its radio is free, and the watchdog opens
-both links itself and flies the blind way down: level, a little less than the last trim, then stop. It uses cflib's
-drivers alone: no tables, no parameters, no waiting. It goes before the runner wherever that goes before others.
+The runner's main thread writes a frame with its time at every tick. A closed pipe means that the runner died, an old
+frame in flight that it hangs; it is then killed, so that its radio is free. The watchdog opens both links and flies a
+blind descent: level, a little below the last trim, then stop. It uses only cflib's drivers: no tables, no parameters,
+no waiting. If the runner has real-time priority, the watchdog has a higher one.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from mjxfly.packets import Packet, Setpoint
 from mjxfly.process import Child, urgent
 from mjxfly.setpoints import LastKnownState, blind_shares
 
-FRAME = struct.Struct("<BdHHfff")  # what is going on, when [s], then `LastKnownState`
+FRAME = struct.Struct("<BdHHfff")  # IDLE, FLYING or GOODBYE; time [s]; `LastKnownState`
 IDLE, FLYING, GOODBYE = 0, 1, 2
 SILENCE = 0.3  # [s] without a frame while flying: the firmware levels at 0.5 s and stops at 2 s
-PERIOD = 0.02  # [s] of the setpoints on the way down
+PERIOD = 0.02  # [s] between two setpoints of the descent
 STOPPING = 0.5  # [s] for which stops are repeated
-ZEROS = 2.3  # [s] of zeros after that: a firmware that counts as flying and hears nothing for 2 s locks itself
-OPENING = 2.0  # [s] for which a link is tried: then the firmware has stopped by itself
+ZEROS = 2.3  # [s] of zeros after that: firmware that counts as flying and hears nothing for 2 s locks itself
+OPENING = 2.0  # [s] for which opening a link is tried: by then the firmware has stopped by itself
 NOTHING = LastKnownState((0, 0), 0.0, 0.0, 0.0)
 
 
 def packed(state: int, seen: LastKnownState) -> bytes:
-    """One frame, of now."""
+    """One frame with the present time."""
     return FRAME.pack(state, clock.now(), *seen.trims, seen.height, seen.climb, seen.lift)
 
 
 class Watchdog(Child):
-    """The runner's end. A context manager; `beat` never blocks."""
+    """The runner's side of the watchdog. A context manager; `beat` never blocks."""
 
     def __init__(self, uris: Sequence[str], start_limit: float = 15.0, rehearses: bool = False):
         """Start the process, with this one's clock. Raises InputError if it is not ready within `start_limit` [s].
 
-        In a rehearsal a flight that stands still is taken for a computer that is too slow.
+        In a rehearsal its messages blame a slow computer for a flight program that hangs.
         """
         failure = f"the watchdog process was not ready within {start_limit:g} s"
         flags = [f"--slow={clock.factor()}", *(["--rehearses"] if rehearses else [])]
@@ -59,11 +59,11 @@ class Watchdog(Child):
         os.set_blocking(self._pipe, False)
 
     def beat(self, flying: bool, seen: LastKnownState) -> bool:
-        """We live, and this is what it would take over; false if the watchdog has ended, or does not read."""
+        """Write a frame with the pair's state `seen`; false if the watchdog has ended or does not read."""
         return self._write(packed(FLYING if flying else IDLE, seen))
 
     def leave(self) -> None:
-        """Have it take over what flies, as if this process were dead."""
+        """Close the pipe, so that the watchdog takes over as if this process had died."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -80,13 +80,13 @@ class Watchdog(Child):
 
 
 def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
-    """Read frames from `pipe` until the runner is gone; None if all is well, else what to take over with.
+    """Read frames from `pipe` until the runner ends; None if it ended normally or on the ground.
 
-    That is the last one and how long ago it was written [s].
+    Else the pair's last state and its age [s], from which the watchdog takes over. A runner that hangs is killed.
     """
     state, written, seen, waiting = IDLE, 0.0, NOTHING, b""
     while True:
-        # Not from when it was read: a watchdog that woke late would wait for as long again.
+        # Time since the frame was written, not read: a watchdog that woke late must not wait that long again.
         left = written + SILENCE - clock.now() if state == FLYING else math.inf
         readable, _, _ = select.select([pipe], [], [], None if math.isinf(left) else clock.real(max(left, 0.0)))
         if not readable:  # it hangs in the air: only its death frees the radio
@@ -105,9 +105,9 @@ def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
 
 
 def way_down(number: int, seen: LastKnownState, unheard: float) -> list[Packet]:
-    """What drone `number` is sent, one packet per period: level and sinking, then stops and zeros.
+    """Packets for drone `number`, one per `PERIOD`: a level descent, then stops and zeros.
 
-    Both drones' lists are equally long, so that they stay together.
+    Both drones' lists have the same length, so that they stay in step.
     """
     shares = blind_shares(seen, unheard, PERIOD)
     thrusts = [min(round(share * seen.trims[number]), packets.THRUST_CEILING) for share in shares]
@@ -117,7 +117,7 @@ def way_down(number: int, seen: LastKnownState, unheard: float) -> list[Packet]:
 
 
 def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
-    """Open the link at `uri` and send `plan` by the clock from `start` [s], so that both drones stay together."""
+    """Open the link at `uri` and send `plan` at fixed times from `start` [s], so that both drones stay in step."""
     import cflib.crtp
     from cflib.crtp.crtpstack import CRTPPacket
 
@@ -127,7 +127,7 @@ def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
     for number, packet in enumerate(plan):
         wait = start + number * PERIOD - clock.now()
         if wait < -PERIOD and number < len(plan) - 5:
-            continue  # the time of this one passed while the link was opened
+            continue  # its time passed while the link was opened
         clock.sleep(max(wait, 0.0))
         wire = CRTPPacket()
         wire.set_header(packet.port, packet.channel)
@@ -139,7 +139,7 @@ def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
 
 
 def _open(crtp: Any, uri: str) -> Any:
-    """The driver for `uri`; tried again while the dead runner's radio is not free yet."""
+    """The driver for `uri`, retried until the dead runner's radio is free; None after `OPENING` seconds."""
     deadline = clock.now() + OPENING
     while clock.now() < deadline:
         with contextlib.suppress(Exception):
@@ -149,7 +149,7 @@ def _open(crtp: Any, uri: str) -> Any:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """`python -m mjxfly.watchdog RUNNER_PID URI URI`: watch standard input."""
+    """`python -m mjxfly.watchdog RUNNER_PID URI URI`: watch standard input; return the exit code."""
     parser = make_parser("python -m mjxfly.watchdog", "Watch over a flight; started by mjxfly, not by hand.")
     parser.add_argument("runner", type=int, metavar="RUNNER_PID")
     parser.add_argument("uris", nargs=2, metavar="URI")
@@ -171,7 +171,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _warm_up() -> None:
-    """Whatever taking over would do for the first time."""
+    """Run the code of a take-over once, so that nothing is loaded then."""
     import cflib.crtp.crtpstack
     import cflib.crtp.udpdriver  # noqa: F401
 
@@ -182,7 +182,7 @@ def _warm_up() -> None:
 
 
 def take_over(uris: Sequence[str], left: tuple[LastKnownState, float], rehearses: bool) -> None:
-    """Bring both drones down, from what `watch` returned."""
+    """Bring both drones down from (state, age [s]) as returned by `watch`."""
     start = clock.now()
     threads = [
         threading.Thread(target=bring_down, args=(uri, way_down(number, *left), start), daemon=True)
@@ -191,13 +191,13 @@ def take_over(uris: Sequence[str], left: tuple[LastKnownState, float], rehearses
     for thread in threads:
         thread.start()
     if left[1] >= SILENCE:
-        warn(told(left[1], rehearses))
+        warn(hang_message(left[1], rehearses))
     for thread in threads:
         thread.join(timeout=clock.real(OPENING + 5))
 
 
-def told(silent: float, rehearses: bool) -> str:
-    """Of a flight process that was `silent` for so long [s], one sentence."""
+def hang_message(silent: float, rehearses: bool) -> str:
+    """Message on a flight process that was `silent` for so long [s]."""
     if rehearses:
         return clock.too_slow(f"the flight process stood still for {silent:.2f} s")
     return f"the watchdog heard nothing of the flight for {silent:.2f} s and ended it; it brings both drones down"
