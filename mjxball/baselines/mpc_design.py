@@ -211,8 +211,9 @@ def _followers_command(
 
 def _leaders_command(config: Config) -> np.ndarray:
     """(3, 18) what the leader's PD law commands."""
+    kp, kd, gravity, *_ = copy_gains(config)
     led, units = np.zeros((3, STATES)), np.eye(OBSERVATION_SIZE)[ERROR.start :]  # of each error and rate
-    led[:, [EX, EY, EZ, VX, VY, VZ]] = copy_command(units, *copy_gains(config)[:3], math.inf, math.inf).T
+    led[:, [EX, EY, EZ, VX, VY, VZ]] = copy_command(units, kp, kd, gravity, math.inf, math.inf).T
     return led
 
 

@@ -86,6 +86,8 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.integrate_quaternion": (rotations.integrate_quaternion, (QUATERNION, 0.2 * EULER)),
     "rotations.solve": (rotations.solve, (SYMMETRIC, normal(3))),
     "rotations.dot": (rotations.dot, (normal(3), normal(3))),
+    "rotations.conjugate": (rotations.conjugate, (QUATERNION,)),
+    "rotations.tilt_of_quaternion": (rotations.tilt_of_quaternion, (QUATERNION,)),
     "rotations.roll_of_quaternion": (rotations.roll_of_quaternion, (QUATERNION,)),
     "leader.pid_command": (
         lambda *errors: leader.pid_command(*errors, (KP, KD, KI), G, *LIMITS),
