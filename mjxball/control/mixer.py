@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from mjxball.arrays import Array, joined
-from mjxball.control import rotations
 from mjxball.plant.rotors import lever
 
 
@@ -26,8 +25,11 @@ def turned(wrench: Array, yaw: Array | float) -> Array:
     """
     if isinstance(yaw, float) and yaw == 0.0:
         return wrench
-    torque = rotations.turned_about_z(wrench[..., 1:], yaw)
-    return wrench.__array_namespace__().concat([wrench[..., :1], torque], axis=-1)
+    xp = wrench.__array_namespace__()
+    yaw = xp.asarray(yaw, dtype=wrench.dtype)
+    c, s = xp.cos(yaw), xp.sin(yaw)
+    thrust, x, y, z = (wrench[..., i] for i in range(4))
+    return joined([thrust, c * x - s * y, s * x + c * y, z])
 
 
 def rotors_from_wrench(wrench: Array, arm: Array | float, yaw_per_thrust: Array | float, layout: str = "plus") -> Array:
