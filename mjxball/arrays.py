@@ -35,12 +35,21 @@ def _has_mask(given: Any) -> bool:
     return isinstance(given, np.ma.MaskedArray)
 
 
+def components(vector: Array) -> Sequence[Array]:
+    """The n parts (...) of `vector` (..., n). One vector of NumPy's, (n,), as floats: ten times as quick."""
+    if isinstance(vector, np.ndarray) and vector.ndim == 1 and vector.dtype == float:
+        return vector.tolist()
+    return [vector[..., i] for i in range(vector.shape[-1])]
+
+
 def joined(components: Sequence[Array], axis: int = -1) -> Array:
     """Arrays of one shape as one, along a new last `axis` (-1) or last but one (-2).
 
-    What `stack` does, of which NumPy's takes twice as long on small arrays.
+    What `stack` does, of which NumPy's takes twice as long on small arrays. Floats become a vector.
     """
     first = components[0]
+    if isinstance(first, float):
+        return np.array(components)
     if isinstance(first, np.ndarray | np.generic):
         index = (..., None) if axis == -1 else (..., None, slice(None))
         return np.concatenate([component[index] for component in components], axis=axis)

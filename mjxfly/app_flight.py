@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxfly.app.protocol import CANNOT_FLY, GROUP, AppSample, Phase, order, reason, upload
 from mjxfly.connection import LinkError
 from mjxfly.flight import Flight
 from mjxfly.limits import NAMES, Check, FlightSettings
 from mjxfly.link import Link
-from mjxfly.monitor import UplinkWatch, tilt_angle
+from mjxfly.monitor import UplinkWatch
 from mjxfly.packets import ZERO, Setpoint
 from mjxfly.setpoints import CURVE_NAMES, CurveName, Mapped, Variant, Variants
 from mjxfly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, State
@@ -144,7 +145,7 @@ class OnboardFlight(Flight):
             self._highest_place = max(self._highest_place, self._height(seen))
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
-                self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
+                self.flown.update(self._now, self.elapsed, distance, rotations.tilt_of_quaternion(seen.quaternion))
         return None, []
 
     def _is_airborne(self) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from mjxball.control import rotations
 from mjxfly import packets, probe, setpoints
 from mjxfly.card import Commands, Controller
 from mjxfly.display import View
@@ -17,7 +18,7 @@ from mjxfly.figures import Flown
 from mjxfly.lift import LiftWatch
 from mjxfly.limits import FlightSettings
 from mjxfly.mocap import Mocap
-from mjxfly.monitor import Monitor, Sustained, UplinkWatch, link_faults, tilt_angle
+from mjxfly.monitor import Monitor, Sustained, UplinkWatch, link_faults
 from mjxfly.packets import ZERO, PacketError, Setpoint
 from mjxfly.preflight import SpinCheck
 from mjxfly.setpoints import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
@@ -140,7 +141,7 @@ class Flight:
     def _distrust(self) -> str:
         """Why the pair's estimated state cannot be trusted, empty if it can."""
         fresh = [state for state, known in zip(self._states, self._fresh, strict=True) if known]
-        if not all(tilt_angle(state.quaternion) <= self.settings.limits.tilt for state in fresh):
+        if not all(rotations.tilt_of_quaternion(state.quaternion) <= self.settings.limits.tilt for state in fresh):
             return "it turned over"
         estimators = self._monitor.estimators
         believed = any(estimators.trusted) and not estimators.contradiction
@@ -226,7 +227,8 @@ class Flight:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
                 nominal = [own.map.hover_thrust for own in self.spin.chosen()]
                 one, other = (sent.thrust / hover for sent, hover in zip(self._sent, nominal, strict=True))
-                self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
+                tilt = rotations.tilt_of_quaternion(seen.quaternion)
+                self.flown.update(self._now, self.elapsed, distance, tilt, (one, other))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
             commands = [own + self._probe() for own in (self._commands.leader, self._commands.follower)]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjxball.control import motors
+from mjxball.control import motors, rotations
 from mjxball.control.motors import Motor
 from mjxfly.limits import NAMES
 from mjxfly.setpoints import CommandMap
@@ -83,7 +83,7 @@ class LiftWatch:
         up, rising = 0.0, 0.0  # the leader above the follower [m], and how fast [m/s]
         if seen is not None:
             up = float(seen.matrix[2] @ rig.span)
-            rising = float(seen.matrix[2] @ np.cross(seen.rates, rig.span))
+            rising = float(seen.matrix[2] @ rotations.cross(seen.rates, rig.span))
         excess = LEVELLING[0] * up + LEVELLING[1] * rising
         most = [ALL if share < SCARCE else self.share for share in self.shares]
         return [most[0] - max(excess, 0.0), most[1] - max(-excess, 0.0)]

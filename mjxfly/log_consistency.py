@@ -83,8 +83,7 @@ def way(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Motion:
 def turn(time: np.ndarray, quaternion: np.ndarray, rates: np.ndarray) -> Motion:
     """`Motion` of attitudes (n, 4) and rates (n, 3) [rad/s] in the drone's axes."""
     begin, end = _spans(time)
-    back = quaternion[begin] * np.array([1.0, -1.0, -1.0, -1.0])
-    apart = np.asarray(rotations.multiply_quaternions(back, quaternion[end]))
+    apart = np.asarray(rotations.multiply_quaternions(rotations.conjugate(quaternion[begin]), quaternion[end]))
     apart = np.where(apart[:, :1] < 0, -apart, apart)
     step = (time[end] - time[begin])[:, None]
     return Motion(2 * apart[:, 1:] / step, _integral(time, rates, begin, end) / step)

@@ -152,8 +152,7 @@ def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[
         rates = at(time, own["rates"])
     else:
         change = np.gradient(quaternion, time, axis=0)
-        back = quaternion * np.array([1.0, -1.0, -1.0, -1.0])
-        rates = 2 * np.asarray(rotations.multiply_quaternions(back, change))[:, 1:]
+        rates = 2 * np.asarray(rotations.multiply_quaternions(rotations.conjugate(quaternion), change))[:, 1:]
         derived.append("rates")
     if derived:
         remark(f"the {name}'s {' and '.join(derived)} are differences of its poses")

@@ -234,7 +234,7 @@ class DroneWatch:
 
 def relative(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(4,) quaternion of the rotation from `one` to `other`, in the body axes of `one`."""
-    return np.asarray(rotations.multiply_quaternions(one * np.array([1.0, -1.0, -1.0, -1.0]), other))
+    return np.asarray(rotations.multiply_quaternions(rotations.conjugate(one), other))
 
 
 def unit(quaternion: Sequence[float]) -> np.ndarray:

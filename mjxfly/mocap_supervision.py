@@ -196,8 +196,9 @@ def standing_fault(tracks: Tracks, now: float, limits: MocapLimits, span: np.nda
 
 def posture_fault(pose: Pose, limits: MocapLimits) -> str:
     """How `pose` differs from that of a body that stands level and points along +x, empty if it does not."""
-    roll, pitch, yaw = rotations.euler_from_matrix(rotations.matrix_from_quaternion(np.array(pose.quaternion)))
-    tilt = math.acos(min(max(math.cos(roll) * math.cos(pitch), -1.0), 1.0))
+    quaternion = np.array(pose.quaternion)
+    yaw = rotations.euler_from_matrix(rotations.matrix_from_quaternion(quaternion))[2]
+    tilt = rotations.tilt_of_quaternion(quaternion)
     if tilt > limits.tilt:
         return f"tilts {math.degrees(tilt):.0f} degrees as it stands; are Z up and the body's axes set as the drone's?"
     if abs(yaw) > limits.yaw:

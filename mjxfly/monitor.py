@@ -53,11 +53,6 @@ class Sustained:
         return now - self._since >= self.seconds
 
 
-def tilt_angle(quaternion: np.ndarray) -> float:
-    """Angle between body z and up [rad], of a unit `quaternion` (w, x, y, z)."""
-    return math.acos(min(max(packets.level_share(quaternion), -1.0), 1.0))
-
-
 def down_reason(info: int, armed: bool = True) -> str:
     """Why the firmware will not fly, by its `info` bits, empty if it will; CAN_FLY counts only if it is `armed`."""
     for bit, reason in ((packets.LOCKED, "is locked"), (packets.CRASHED, "crashed"), (packets.TUMBLED, "tumbled")):
@@ -157,7 +152,7 @@ class Monitor:
     def _from_state(self, name: str, state: DroneState, limits: Limits, armed: bool) -> list[Fault]:
         if not np.isfinite([*state.position, *state.velocity, *state.quaternion, *state.rates]).all():
             return [Fault(Event.BAD_STATE, f"state of the {name} is not finite")]
-        faults, place, tilt = [], state.position - self.origin, tilt_angle(state.quaternion)
+        faults, place, tilt = [], state.position - self.origin, rotations.tilt_of_quaternion(state.quaternion)
         if (place < limits.fence_low).any() or (place > limits.fence_high).any():
             where = ", ".join(f"{value:.2f}" for value in place)
             faults.append(Fault(Event.FENCE, f"{name} at ({where}) m"))
@@ -222,7 +217,7 @@ class EstimatorWatch:
         leader, follower = (sample.state for sample in samples)
         matrices = [rotations.matrix_from_quaternion(state.quaternion) for state in (leader, follower)]
         matrix, span = 0.5 * (matrices[0] + matrices[1]), self._rig.span
-        turning = np.cross(0.5 * (leader.rates + follower.rates), span)
+        turning = rotations.cross(0.5 * (leader.rates + follower.rates), span)
         later = (samples[0].arrival - samples[1].arrival) * 0.5 * (leader.velocity + follower.velocity)
         beside = leader.position - follower.position - later - matrix @ span
         faster = float((leader.velocity - follower.velocity - matrix @ turning)[2])

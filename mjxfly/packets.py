@@ -232,8 +232,3 @@ def decompress_quaternion(packed: int) -> np.ndarray:
         raise PacketError("the quaternion is not one of unit length")
     wire[largest] = math.sqrt(rest)
     return np.array([wire[3], wire[0], wire[1], wire[2]])
-
-
-def level_share(quaternion: np.ndarray) -> float:
-    """Cosine of the angle between body z and up, of a unit `quaternion` (w, x, y, z)."""
-    return 1.0 - 2.0 * (float(quaternion[1]) ** 2 + float(quaternion[2]) ** 2)

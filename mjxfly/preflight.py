@@ -26,7 +26,7 @@ from mjxfly.connection import LinkError
 from mjxfly.limits import NAMES, Check, Limits
 from mjxfly.link import Link
 from mjxfly.mocap import KALMAN, Mocap
-from mjxfly.monitor import down_reason, stick_faults, tilt_angle
+from mjxfly.monitor import down_reason, stick_faults
 from mjxfly.packets import GRAVITY, THRUST_CEILING, DroneState, Health
 from mjxfly.process import together, wait_until
 from mjxfly.setpoints import CURVE_NAMES, CurveName, Variant, Variants
@@ -194,7 +194,7 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
         states.append(state)
         refusal = down_reason(state.info, armed=False)
         can = _can_start(state.info)
-        tilt, yaw = tilt_angle(state.quaternion), yaw_of(state)
+        tilt, yaw = rotations.tilt_of_quaternion(state.quaternion), yaw_of(state)
         fresh, alive = rate >= required.rate, refusal or ("can fly" if can else "cannot arm")
         rows: tuple[tuple[str, bool, str, str], ...] = (
             ("states", fresh, f"{rate:.0f} Hz, {required.rate:.0f} needed", BUSY),

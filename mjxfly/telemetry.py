@@ -199,7 +199,7 @@ def object_of_one(state: DroneState, mount: np.ndarray) -> ObjectState:
     """State of the object from one drone's: p_O = p - R r, with `mount` r (3,) [m]."""
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     position = state.position - matrix @ mount
-    velocity = state.velocity - matrix @ np.cross(state.rates, mount)
+    velocity = state.velocity - matrix @ rotations.cross(state.rates, mount)
     return ObjectState(position, velocity, state.quaternion, state.rates)
 
 

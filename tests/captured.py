@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.control import rotations
 from mjxball.policy import Policy
 from mjxfly import mocap_supervision as supervision
 from mjxfly.limits import FlightSettings
 from mjxfly.mocap import Mocap, MocapSettings
 from mjxfly.mocap_supervision import Frame, Pose
 from mjxfly.twin.conditions import QUIET
-from mjxfly.twin.estimators import product
 from mjxfly.twin.positioning import ATTITUDE_NOISE, POSITION_NOISE
 from mjxfly.twin.virtual import STEP, VirtualTwin
 
@@ -63,7 +63,9 @@ class CapturedTwin(VirtualTwin):
     def _pose(self, number: int) -> Pose:
         drawn = self._noise.standard_normal(6)
         place = self.state.position[number] + POSITION_NOISE * drawn[:3]
-        turned = product(self.state.quaternion[number], np.array([1.0, *(0.5 * ATTITUDE_NOISE * drawn[3:])]))
+        turned = rotations.multiply_quaternions(
+            self.state.quaternion[number], np.array([1.0, *(0.5 * ATTITUDE_NOISE * drawn[3:])])
+        )
         pose = supervision.pose_of(self.now, [*place, *turned])
         assert pose is not None
         return pose

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array, matmul
+from mjxball.arrays import Array, clipped, matmul
 from mjxball.config import Config
 from mjxball.control import leader, rotations
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -135,14 +135,12 @@ class CopiedPid:
 
     def step(self, integral: Any, observation: Array) -> tuple[Any, Array]:
         """(integral, command (..., 3)) at `observation` (..., 18), both in body axes."""
-        xp, dtype = observation.__array_namespace__(), observation.dtype
         if not any(self._pid[2]):
             return integral, copy_command(observation, *self._pd)
-        error = observation[..., ERROR]
-        gains = (xp.asarray(gain, dtype=dtype) for gain in self._pid)
-        wanted = leader.desired_acceleration(error, observation[..., ERROR_RATE], integral, *gains)
-        band = xp.asarray(self._band, dtype=dtype)
-        return integral + self._period * xp.clip(error, -band, band), leader.command(wanted, 0.0, *self._pd[2:])
+        error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
+        band = error.__array_namespace__().asarray(self._band, dtype=error.dtype)
+        command = leader.pid_command(error, rate, integral, self._pid, *self._pd[2:])
+        return integral + self._period * clipped(error, -band, band), command
 
 
 def ideal_model(config: Config, name: str) -> AssemblyModel:

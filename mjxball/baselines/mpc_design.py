@@ -33,6 +33,8 @@ from mjxball.baselines.motion import (
 )
 from mjxball.config import Config
 from mjxball.control import mixer
+from mjxball.control.followers import copy_gains
+from mjxball.control.observation import ERROR, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 
@@ -209,10 +211,9 @@ def _followers_command(
 
 def _leaders_command(config: Config) -> np.ndarray:
     """(3, 18) gains of the leader's PD controller on the state."""
-    led, g = np.zeros((3, STATES)), config.plant.gravity
-    kp, kd = (np.broadcast_to(gain, 3) for gain in (config.leader.kp, config.leader.kd))
-    led[0, [EY, VY]], led[1, [EX, VX]] = np.array([-kp[1], -kd[1]]) / g, np.array([kp[0], kd[0]]) / g
-    led[2, [EZ, VZ]] = kp[2], kd[2]
+    kp, kd, gravity, *_ = copy_gains(config)
+    led, units = np.zeros((3, STATES)), np.eye(OBSERVATION_SIZE)[ERROR.start :]  # of each error and rate
+    led[:, [EX, EY, EZ, VX, VY, VZ]] = copy_command(units, kp, kd, gravity, math.inf, math.inf).T
     return led
 
 

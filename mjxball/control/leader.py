@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 from mjxball.arrays import Array, clipped, joined
 
 
-def desired_acceleration(error: Array, error_rate: Array, integral: Array, kp: Array, kd: Array, ki: Array) -> Array:
-    """kp e + kd de/dt + ki int(e) (paper eq. 5), all (..., 3) -> (..., 3) [m/s2]."""
-    return kp * error + kd * error_rate + ki * integral
+def pid_command(error: Array, error_rate: Array, integral: Array, gains: Sequence[Any], *limits: float) -> Array:
+    """`command` at yaw 0 for kp e + kd de/dt + ki int(e) [m/s2] (paper eq. 5), all (..., 3).
+
+    `gains`: kp, kd, ki, each (3,) or a number; `limits`: the gravity and the limits that `command` takes.
+    """
+    xp = error.__array_namespace__()
+    kp, kd, ki = (xp.asarray(gain, dtype=error.dtype) for gain in gains)
+    return command(kp * error + kd * error_rate + ki * integral, 0.0, *limits)
 
 
 def command(acceleration: Array, yaw: Array | float, gravity: float, tilt_limit: float, vertical_limit: float) -> Array:

@@ -80,12 +80,9 @@ def copy_command(
     observation: Array, kp: Array, kd: Array, gravity: float, tilt_limit: float, vertical_limit: float
 ) -> Array:
     """The `copy` follower: the leader's PD law on the follower's own observation (..., 18) -> command (..., 3)."""
-    xp = observation.__array_namespace__()
-    kp, kd = (xp.asarray(gain, dtype=observation.dtype) for gain in (kp, kd))
-    acceleration = leader.desired_acceleration(
-        observation[..., ERROR], observation[..., ERROR_RATE], xp.zeros_like(observation[..., ERROR]), kp, kd, 0.0
-    )
-    return leader.command(acceleration, 0.0, gravity, tilt_limit, vertical_limit)
+    error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
+    zero = observation.__array_namespace__().zeros_like(error)
+    return leader.pid_command(error, rate, zero, (kp, kd, 0.0), gravity, tilt_limit, vertical_limit)
 
 
 def commanded(load_axis_only: bool, cg_axis: str) -> tuple[float, float, float]:

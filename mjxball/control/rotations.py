@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjxball.arrays import Array, clipped, joined
+from mjxball.arrays import Array, clipped, components, joined
 
 
 def rotate(matrix: Array, vector: Array) -> Array:
@@ -35,7 +35,7 @@ def dot(a: Array, b: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """a x b for (..., 3) each, broadcast -> (..., 3)."""
-    (ax, ay, az), (bx, by, bz) = ([vector[..., i] for i in range(3)] for vector in (a, b))
+    (ax, ay, az), (bx, by, bz) = components(a), components(b)
     return joined([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
@@ -50,7 +50,7 @@ def euler_from_matrix(matrix: Array) -> Array:
 
 def matrix_from_quaternion(quaternion: Array) -> Array:
     """R of a unit `quaternion` (w, x, y, z) (..., 4) -> (..., 3, 3)."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
+    w, x, y, z = components(quaternion)
     return joined(
         [
             joined([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
@@ -63,8 +63,7 @@ def matrix_from_quaternion(quaternion: Array) -> Array:
 
 def multiply_quaternions(a: Array, b: Array) -> Array:
     """Hamilton product a b of `a`, `b` (w, x, y, z) (..., 4) -> (..., 4)."""
-    aw, ax, ay, az = (a[..., i] for i in range(4))
-    bw, bx, by, bz = (b[..., i] for i in range(4))
+    (aw, ax, ay, az), (bw, bx, by, bz) = components(a), components(b)
     return joined(
         [
             aw * bw - ax * bx - ay * by - az * bz,
@@ -75,11 +74,17 @@ def multiply_quaternions(a: Array, b: Array) -> Array:
     )
 
 
+def conjugate(quaternion: Array) -> Array:
+    """(..., 4) that turns back what the unit `quaternion` (w, x, y, z) (..., 4) turns."""
+    w, x, y, z = components(quaternion)
+    return joined([w, -x, -y, -z])
+
+
 def quaternion_from_euler(euler: Array) -> Array:
     """Unit quaternion of Rz(psi) Rx(phi) Ry(theta), `euler` = (phi, theta, psi) (..., 3) -> (..., 4)."""
     xp = euler.__array_namespace__()
     half = euler / 2
-    (cx, cy, cz), (sx, sy, sz) = ([part[..., i] for i in range(3)] for part in (xp.cos(half), xp.sin(half)))
+    (cx, cy, cz), (sx, sy, sz) = components(xp.cos(half)), components(xp.sin(half))
     w, x, y, z = cz * cx, cz * sx, sz * sx, sz * cx  # of Rz Rx
     return joined([w * cy - y * sy, x * cy - z * sy, w * sy + y * cy, x * sy + z * cy])
 
@@ -88,6 +93,12 @@ def roll_of_quaternion(quaternion: Array) -> Array:
     """Angle (...) [rad] of a `quaternion` (..., 4) that turns about x alone."""
     xp = quaternion.__array_namespace__()
     return 2 * xp.atan2(quaternion[..., 1], quaternion[..., 0])
+
+
+def tilt_of_quaternion(quaternion: Array) -> Array:
+    """Angle (...) [rad] between body z and up of a unit `quaternion` (..., 4)."""
+    xp = quaternion.__array_namespace__()
+    return xp.acos(clipped(1.0 - 2.0 * (quaternion[..., 1] ** 2 + quaternion[..., 2] ** 2), -1.0, 1.0))
 
 
 def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:

@@ -155,7 +155,7 @@ class MujocoWorld:
         result = np.empty((2, len(self._drones), 3))
         for number, body in enumerate(self._drones):
             torque, force = -self.data.cfrc_int[body, :3], -self.data.cfrc_int[body, 3:]
-            moved = torque + np.cross(about - self.data.xipos[body], force)
+            moved = torque + rotations.cross(about - self.data.xipos[body], force)
             result[:, number] = force @ matrix, moved @ matrix
         return result
 

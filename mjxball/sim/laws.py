@@ -227,10 +227,9 @@ class Laws:
         return self._clip(self._with_lift_difference(command + more - integral[..., 4:], integral, -self._lift_sign))
 
     def _pid_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
-        xp, law = goal.__array_namespace__(), self._law
-        gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
-        wanted = leader.desired_acceleration(*self.leader_error(state, goal), integral[..., :3], *gains)
-        return leader.command(wanted, 0.0, self._gravity, *self._limits)
+        error, rate = self.leader_error(state, goal)
+        gains = self._law.kp, self._law.kd, self._law.ki
+        return leader.pid_command(error, rate, integral[..., :3], gains, self._gravity, *self._limits)
 
     def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:
         """`command` with what this drone lifts more than the other to turn the stick."""

@@ -23,7 +23,6 @@ from mjxball.physics.mujoco import slide_force
 from mjxball.physics.step import rotor_shares
 from mjxfly.twin.avionics import TICK, Onboard, Power
 from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
-from mjxfly.twin.estimators import matrix_of, skew
 from mjxfly.twin.pair import RUNNING, Modes, PairState
 
 STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
@@ -273,12 +272,12 @@ class CoupledPair:
     def _pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions (2, 3) of both drones, and the body's quaternion (4,) and rotation matrix (3, 3)."""
         quaternion = self._quaternion()
-        matrix = matrix_of(quaternion)
+        matrix = rotations.matrix_from_quaternion(quaternion)
         return self._of_origin(self.data.qpos) + self._mounts @ matrix.T, quaternion, matrix
 
     def _velocity(self, matrix: np.ndarray) -> np.ndarray:
         """Velocities (2, 3) of both drones in the world."""
-        return self._of_origin(self.data.qvel) - self._mounts @ skew(self._rates()) @ matrix.T
+        return self._of_origin(self.data.qvel) + rotations.cross(self._rates(), self._mounts) @ matrix.T
 
     def _state(self) -> PairState:
         position, quaternion, matrix = self._pose()

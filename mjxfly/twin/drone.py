@@ -10,11 +10,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from mjxball.errors import InputError
 from mjxfly.app.host import App, Library, State
 from mjxfly.app.protocol import CONTROLLER, GROUP, OUT_OF_TREE, PID
 from mjxfly.packets import ZERO, Setpoint
 from mjxfly.twin import avionics
-from mjxfly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
+from mjxfly.twin.conditions import FAULT_KINDS, BodyFault, DroneFaults, LinkFaults, What
 from mjxfly.twin.firmware import Firmware, Motors, Order
 from mjxfly.twin.logs import Readings, Snapshot
 from mjxfly.twin.pair import Modes, Pair, PairState
@@ -101,7 +102,9 @@ class TwinDrone:
         return self.faults.stopped or self.firmware.dead or self.firmware.booting
 
     def inject(self, what: What) -> None:
-        """Inject a fault; "port" is handled by the server."""
+        """Inject a fault; "port" is handled by the server. Raises InputError for what is no fault."""
+        if what not in [kind.what for kind in FAULT_KINDS.values()]:
+            raise InputError(f"{what!r} is no fault; expected FAULT_KINDS[kind].what, kind of {', '.join(FAULT_KINDS)}")
         match what:
             case LinkFaults():
                 self.link = what

@@ -13,6 +13,14 @@ import math
 
 import numpy as np
 
+from mjxball.control.rotations import (
+    conjugate,
+    cross,
+    integrate_quaternion,
+    matrix_from_quaternion,
+    multiply_quaternions,
+)
+
 GRAVITY = 9.81  # [m/s2]
 LARGEST, LEAST = 100.0, 1e-6  # of the covariance
 START = np.array([100.0, 100.0, 1.0, *[0.01] * 6])  # standard deviations after a reset [m, m/s, rad]
@@ -31,7 +39,12 @@ class Kalman:
     def __init__(self) -> None:
         self.covariance = np.zeros((9, 9))
         self.position, self.body_velocity = np.zeros(3), np.zeros(3)
-        self.quaternion, self.matrix = UNIT.copy(), np.eye(3)
+        self.quaternion = UNIT.copy()
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) body -> world."""
+        return np.asarray(matrix_from_quaternion(self.quaternion))
 
     def reset(self, position: np.ndarray | None = None, quaternion: np.ndarray | None = None) -> None:
         """Begin anew at the origin, level, or where the arguments say, with large variances."""
@@ -39,7 +52,6 @@ class Kalman:
         self.position = np.zeros(3) if position is None else np.array(position)
         self.body_velocity = np.zeros(3)
         self.quaternion = UNIT.copy() if quaternion is None else np.array(quaternion)
-        self.matrix = matrix_of(self.quaternion)
 
     @property
     def velocity(self) -> np.ndarray:
@@ -63,11 +75,10 @@ class Kalman:
         self.position = self.position + matrix @ moved
         self.position[2] -= 0.5 * dt * dt * GRAVITY
         self.body_velocity = velocity + dt * (force - skew(rates) @ velocity - GRAVITY * down)
-        turned = turn(self.quaternion, dt * rates)
+        self.quaternion = integrate_quaternion(self.quaternion, dt * rates)
         if not flying:
-            turned = (1 - REVERSION) * turned + REVERSION * UNIT
-        self.quaternion = turned / math.sqrt(float(turned @ turned))
-        self.matrix = matrix_of(self.quaternion)
+            turned = (1 - REVERSION) * self.quaternion + REVERSION * UNIT
+            self.quaternion = turned / math.sqrt(float(turned @ turned))
         far = np.abs(self.position).max() > MOST_POSITION or np.abs(self.body_velocity).max() > MOST_VELOCITY
         if far or not np.isfinite(self.position).all():
             self.reset()
@@ -79,7 +90,7 @@ class Kalman:
         error = np.zeros(count)
         error[:3] = position - self.position
         if quaternion is not None:
-            w, x, y, z = product(quaternion, self.quaternion * np.array([1.0, -1.0, -1.0, -1.0]))
+            w, x, y, z = multiply_quaternions(quaternion, conjugate(self.quaternion))
             error[3:] = 2.0 / (w if abs(w) > 1e-3 else 1e-3) * np.array([x, y, z])
         noise = np.array([deviations[0] ** 2] * 3 + [deviations[1] ** 2] * 3)[:count]
         shared = self.covariance[:, rows]
@@ -102,9 +113,7 @@ class Kalman:
         """Move the attitude error (3,) [rad] into the attitude."""
         if not DEAD_ZONE < np.abs(error).max() < 10:
             return
-        turned = turn(self.quaternion, error)
-        self.quaternion = turned / math.sqrt(float(turned @ turned))
-        self.matrix = matrix_of(self.quaternion)
+        self.quaternion = integrate_quaternion(self.quaternion, error)
         half = skew(0.5 * error)
         rotation = np.eye(9)
         rotation[6:9, 6:9] += 0.5 * half @ half - half
@@ -123,40 +132,6 @@ def bounded(covariance: np.ndarray) -> np.ndarray:
     diagonal = even.ravel()[::10]
     np.maximum(diagonal, LEAST, out=diagonal)
     return even
-
-
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product of two quaternions (4,)."""
-    aw, ax, ay, az = a.tolist()
-    bw, bx, by, bz = b.tolist()
-    return np.array(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
-
-
-def turn(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """`quaternion` (4,) turned by the body-axes vector `rotation` (3,) [rad]; not normalised."""
-    x, y, z = rotation.tolist()
-    angle = math.sqrt(x * x + y * y + z * z) + 1e-12
-    sine = math.sin(angle / 2) / angle
-    return product(quaternion, np.array([math.cos(angle / 2), sine * x, sine * y, sine * z]))
-
-
-def matrix_of(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) body -> world of a unit quaternion (4,)."""
-    w, x, y, z = quaternion.tolist()
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def euler_of(quaternion: np.ndarray) -> tuple[float, float, float]:
@@ -186,12 +161,9 @@ class Complementary:
         """`dt` [s] on, from specific force (3,) [m/s2], `rates` (3,) [rad/s] and the true `height` [m]."""
         size = math.sqrt(float(acceleration @ acceleration))
         if size > 1e-3:
-            up = matrix_of(self.quaternion)[2]
-            ax, ay, az = (acceleration / size).tolist()
-            ux, uy, uz = up.tolist()
-            rates = rates + GAIN * np.array([ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux])
-        turned = turn(self.quaternion, dt * rates)
-        self.quaternion = turned / math.sqrt(float(turned @ turned))
+            up = matrix_from_quaternion(self.quaternion)[2]
+            rates = rates + GAIN * cross(acceleration / size, up)
+        self.quaternion = integrate_quaternion(self.quaternion, dt * rates)
         share = dt / AIR_TIME
         old = self.height
         noise = AIR_NOISE * float(self._random.standard_normal())

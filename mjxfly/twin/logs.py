@@ -12,10 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.control.rotations import matrix_from_quaternion
 from mjxfly import packets
 from mjxfly.app.protocol import GROUP, LOGGED
 from mjxfly.packets import Setpoint
-from mjxfly.twin.estimators import euler_of, matrix_of
+from mjxfly.twin.estimators import euler_of
 from mjxfly.twin.pair import Report
 
 GRAVITY = 9.81  # [m/s2]
@@ -67,7 +68,7 @@ class Snapshot(NamedTuple):
     @property
     def world_acceleration(self) -> np.ndarray:
         """(3,) [g], gravity included."""
-        return np.asarray(matrix_of(self.quaternion) @ self.acceleration)
+        return np.asarray(matrix_from_quaternion(self.quaternion) @ self.acceleration)
 
 
 def _named(names: str, values: Iterable[float]) -> dict[str, float]:
@@ -97,7 +98,7 @@ def _kalman(one: Snapshot) -> dict[str, float]:
     values = _named("varX varY varZ varPX varPY varPZ varD0 varD1 varD2", one.report.variance[one.drone])
     if one.report.estimator[one.drone] != 2:
         return values
-    body = matrix_of(one.quaternion).T @ one.report.velocity[one.drone]
+    body = matrix_from_quaternion(one.quaternion).T @ one.report.velocity[one.drone]
     values |= _named("stateX stateY stateZ", one.position) | _named("statePX statePY statePZ", body)
     return values | _named("q0 q1 q2 q3", one.quaternion) | {"rtPred": 100.0, "rtUpdate": 1000.0}
 

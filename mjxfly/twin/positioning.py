@@ -26,8 +26,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from mjxball.control.rotations import conjugate, matrix_from_quaternion, multiply_quaternions
 from mjxfly.twin.conditions import Surroundings
-from mjxfly.twin.estimators import Kalman, matrix_of, product
+from mjxfly.twin.estimators import Kalman
 
 Pose = tuple[np.ndarray, np.ndarray]  # position (3,) [m], quaternion (4,)
 POSITION_NOISE, ATTITUDE_NOISE = 3e-4, 1e-3  # of motion capture: standard deviations [m, rad]
@@ -85,7 +86,7 @@ class Positioning:
     def measure(self, position: np.ndarray, quaternion: np.ndarray) -> Pose:
         """Return the measured pose for the true `position` (3,) and `quaternion` (4,)."""
         noise = self._noise * self._random.standard_normal(6)
-        turned = product(quaternion, np.array([1.0, *(0.5 * ATTITUDE_NOISE * noise[3:])]))
+        turned = multiply_quaternions(quaternion, np.array([1.0, *(0.5 * ATTITUDE_NOISE * noise[3:])]))
         measured = position + POSITION_NOISE * noise[:3]
         return self._disturbed(measured, turned / np.sqrt(turned @ turned))
 
@@ -161,7 +162,7 @@ class Lighthouse(Deck):
         jitter = self.JITTER * self._noise * self._random.standard_normal(3)
         measured = position + self._distortion @ position + jitter
         kalman.correct(measured, None, (self.DEVIATIONS[0], 1.0))
-        turned = product(kalman.quaternion * np.array([1.0, -1.0, -1.0, -1.0]), quaternion)
+        turned = multiply_quaternions(conjugate(kalman.quaternion), quaternion)
         yaw = 2 * turned[3] * math.copysign(1.0, turned[0]) + self.YAW_JITTER * self._normal()
         kalman.correct_one(np.eye(9)[8], yaw, self.DEVIATIONS[1])
 
@@ -213,7 +214,7 @@ class Flow(Deck):
         self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int
     ) -> None:
         before, self._before = self._before, (position, quaternion, step)
-        matrix = matrix_of(quaternion)
+        matrix = matrix_from_quaternion(quaternion)
         if step - self._ranged >= self.HEIGHTS:
             self._ranged, level = step, max(float(kalman.matrix[2, 2]), 0.1)
             row = np.eye(9)[2] / level
@@ -223,7 +224,7 @@ class Flow(Deck):
             return
         dt = (step - before[2]) * 1e-3
         moved = matrix.T @ (position - before[0]) / dt
-        turned = 2 * product(before[1] * np.array([1.0, -1.0, -1.0, -1.0]), quaternion)[1:3] / dt
+        turned = 2 * multiply_quaternions(conjugate(before[1]), quaternion)[1:3] / dt
         scale, height = self.COUNTS * self.PIXELS * dt / self.APERTURE, max(float(kalman.position[2]), self.LOWEST)
         for axis, turn in ((0, -1), (1, 0)):
             sign = 1.0 if axis else -1.0

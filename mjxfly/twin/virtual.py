@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.control import rotations
 from mjxball.policy import Policy
 from mjxfly import app_flight, packets, positioning
 from mjxfly.app.host import Library
@@ -22,7 +23,7 @@ from mjxfly.app.protocol import APP_VARIABLES, sample_of
 from mjxfly.card import Controller, motor_of, times_of, variants
 from mjxfly.flight import Flight
 from mjxfly.limits import NAMES, FlightSettings
-from mjxfly.monitor import down_reason, tilt_angle
+from mjxfly.monitor import down_reason
 from mjxfly.packets import Packet
 from mjxfly.preflight import parameters_of
 from mjxfly.setpoints import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
@@ -290,7 +291,7 @@ class VirtualTwin:
             state=self.flight.supervisor.state.value,
             position=state.position.mean(axis=0),
             velocity=state.velocity.mean(axis=0),
-            tilt=tilt_angle(state.quaternion[0]),
+            tilt=rotations.tilt_of_quaternion(state.quaternion[0]),
             roll=math.atan2(float(line[2]), float(line[1])),
             pwm=state.report.pwm,
             ball=self.pair.cg_offset,

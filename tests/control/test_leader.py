@@ -18,11 +18,13 @@ def command(acceleration, yaw=0.0):
     return leader.command(np.array(acceleration, float), yaw, G, TILT, VERTICAL)
 
 
-def test_desired_acceleration_is_pid():
-    kp, kd, ki = np.array([0.5, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.0, 0.5])
+def test_acceleration_is_pid():
+    gains = np.array([0.5, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.0, 0.5])
     error, rate, integral = np.array([1.0, -2.0, 3.0]), np.array([0.5, 0.25, -1.0]), np.array([10.0, 7.0, 2.0])
-    wanted = leader.desired_acceleration(error, rate, integral, kp, kd, ki)
-    np.testing.assert_allclose(wanted, [0.5 + 0.5 + 1.0, -2.0 + 0.5, 6.0 - 3.0 + 1.0], rtol=ROUNDING)
+    wanted = command([0.5 + 0.5 + 1.0, -2.0 + 0.5, 6.0 - 3.0 + 1.0])
+    np.testing.assert_allclose(
+        leader.pid_command(error, rate, integral, gains, G, TILT, VERTICAL), wanted, rtol=ROUNDING
+    )
 
 
 def test_forward_is_pitch_and_left_is_negative_roll():

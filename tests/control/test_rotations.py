@@ -73,6 +73,14 @@ def test_quaternion_product_is_the_matrix_product(first, second):
     )
 
 
+@given(euler_angles)
+def test_conjugate_turns_back_and_tilt_is_the_angle_of_body_z(euler):
+    quaternion, matrix = rotations.quaternion_from_euler(euler), matrix_from_euler(euler)
+    back = rotations.matrix_from_quaternion(rotations.conjugate(quaternion))
+    np.testing.assert_allclose(back, matrix.T, rtol=0, atol=ROUNDING)
+    assert np.cos(rotations.tilt_of_quaternion(quaternion)) == pytest.approx(matrix[2, 2], abs=ROUNDING)
+
+
 @given(euler_angles, vectors)
 def test_rotate_is_the_matrix_product_and_rotate_back_undoes_it(euler, vector):
     matrix = matrix_from_euler(euler)

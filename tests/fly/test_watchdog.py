@@ -17,6 +17,7 @@ from command_line import REPOSITORY, TRANSPORT, assert_one_line, environment
 from conftest import too_busy
 from tables import rows, weekly
 
+from mjxball.control import rotations
 from mjxball.policy import load_file
 from mjxfly import flight_log, packets, watchdog
 from mjxfly.process import urgent
@@ -189,8 +190,8 @@ def brought_down(flight: Flown | None) -> Flown:
     # Not by the firmware's own watchdog, which locks a drone that hears nothing for 2 s.
     assert not any(info & packets.LOCKED for info in twin.truth.info)
     assert twin.truth.state.position[:, 2].max() < 0.02
-    tilts = [packets.level_share(truth.state.quaternion[0]) for truth in twin.history]
-    assert min(tilts) > np.cos(np.radians(35))
+    tilts = [rotations.tilt_of_quaternion(truth.state.quaternion[0]) for truth in twin.history]
+    assert max(tilts) < np.radians(35)
     return flight
 
 

@@ -86,10 +86,12 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.integrate_quaternion": (rotations.integrate_quaternion, (QUATERNION, 0.2 * EULER)),
     "rotations.solve_symmetric": (rotations.solve_symmetric, (SYMMETRIC, normal(3))),
     "rotations.dot": (rotations.dot, (normal(3), normal(3))),
+    "rotations.conjugate": (rotations.conjugate, (QUATERNION,)),
+    "rotations.tilt_of_quaternion": (rotations.tilt_of_quaternion, (QUATERNION,)),
     "rotations.roll_of_quaternion": (rotations.roll_of_quaternion, (QUATERNION,)),
-    "leader.desired_acceleration": (
-        leader.desired_acceleration,
-        (normal(3), normal(3), normal(3), *map(np.array, (KP, KD, KI))),
+    "leader.pid_command": (
+        lambda *errors: leader.pid_command(*errors, (KP, KD, KI), G, *LIMITS),
+        (normal(3), normal(3), normal(3)),
     ),
     "leader.command": (lambda a, yaw: leader.command(a, yaw, G, *LIMITS), (8 * normal(3), EULER[:, 2])),
     "leader.clip_command": (lambda c: leader.clip_command(c, *LIMITS), (normal(3),)),

@@ -12,6 +12,7 @@ from twin_peer import written
 
 from fly_faults_virtual import SETTLE, settings_of
 from mjxball import config as configs
+from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly import session
@@ -22,7 +23,7 @@ from mjxfly.link import Link
 from mjxfly.main import main as fly
 from mjxfly.mocap import Mocap, MocapSettings
 from mjxfly.twin import virtual
-from mjxfly.twin.conditions import DELIVERED, DRONES, POSITIONING, Conditions, Surroundings
+from mjxfly.twin.conditions import DELIVERED, DRONES, FAULT_KINDS, POSITIONING, BodyFault, Conditions, Surroundings
 from mjxfly.twin.coupled import CoupledPair
 from mjxfly.twin.drone import ACTED, TwinDrone, only_kept
 from mjxfly.twin.firmware import Motors
@@ -52,6 +53,16 @@ def test_the_twin_acts_on_what_it_says_and_keeps_all_else() -> None:
                     acted.add(one.name)
     assert acted == ACTED - {one.name for one in OF_APP}
     assert only_kept(["kalman.mNBaro", "pid_rate.roll_kp", "no.such"]) == ["kalman.mNBaro"]
+
+
+def test_what_is_no_fault_is_refused() -> None:
+    drone = drone_with()
+    for what in ("frozen", FAULT_KINDS["frozen"], BodyFault("frozn", 1.0), None):  # a kind's name, a kind
+        with pytest.raises(InputError, match=r"is no fault; expected FAULT_KINDS"):
+            drone.inject(what)  # type: ignore[arg-type]
+    for kind in FAULT_KINDS.values():
+        drone.inject(kind.what)
+    assert drone.faults == FAULT_KINDS["killed"].what
 
 
 def test_a_controller_that_the_twin_lacks_keeps_its_motors_still() -> None:
