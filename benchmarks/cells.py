@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from batch import Batch
+from batch import fly_compiled
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
 from mjxball.bench.success import PEAK, later
@@ -80,7 +80,7 @@ def medians(flown: list[Any], cells: int) -> list[Row]:
 
 def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Any]:
     """`medians` of a follower's flights."""
-    return medians(Batch(preset("paper"), follower).fly(scenarios_of(cells, common, disturbed, seeds)), len(cells))
+    return medians(fly_compiled(preset("paper"), follower, scenarios_of(cells, common, disturbed, seeds)), len(cells))
 
 
 def reach_of(config: Config, mass: float, known: bool) -> float:

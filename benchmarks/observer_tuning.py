@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball.baselines import Mpc, Observer, Pid
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.followers import Baseline
@@ -114,9 +114,9 @@ def costs_of(
 ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """(cost (S,), medians (S,) under each condition) of `law`, which flies all `drawn` with each of `sets`."""
     config = preset("paper")
-    batch, total, shown = Batch(config, Baseline(law, config)), np.zeros(sets), []
+    total, shown = np.zeros(sets), []
     flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn * sets]
-    flown = batch.fly(flights)
+    flown = fly_compiled(config, Baseline(law, config), flights)
     for runs in (flown[: len(flights) // 2], flown[len(flights) // 2 :]):
         total += cost_of(runs, allowed).reshape(sets, -1).mean(axis=1)
         shown.append(medians(runs, sets))

@@ -41,8 +41,9 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
 from mjxball.physics.step import ControlStep, make_control_step
 from mjxball.plant import plant_parameters
+from mjxball.sim.closed_loop import Commands
 from mjxball.sim.disturbances import record, sensors_of
-from mjxball.sim.rollout import Tick, load_of, start_of
+from mjxball.sim.rollout import Trajectory, load_of, start_of
 from mjxball.train.run_directory import commit, versions
 
 PAIRS = ("pair", "pair-unknown")
@@ -106,15 +107,13 @@ def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
     follower, nothing = plant.followers[0], np.zeros((len(goal), 3))
     sensed, measured = sensors.start(truth(state, follower), samples.at(0), delays)
     running = metrics.begin(state.position, goal, state.rotor_force, plant.leader)
+    limits = metrics.rotor_limits(plant, scenarios)
     command = 2 * np.clip(state.rotor_force / most, 0.0, 1.0) - 1
     for number in range(count + 1):
         if number % 2 == 0:  # the 50 Hz of every other follower's flights
-            matrix = rotations.matrix_from_quaternion(state.quaternion)
-            euler = rotations.euler_from_matrix(matrix)
-            flown = (number * PERIOD, state.position, goal, euler, state.rotor_force, nothing, nothing)
-            tick = Tick(*flown, diverged=np.asarray(has_diverged(state)))
-            limits = metrics.rotor_limits(plant, scenarios)
-            running = metrics.update(running, tick, config.scenario.termination_distance, limits, plant.leader)
+            time, commands = np.asarray(number * PERIOD), Commands(nothing, nothing)
+            row = Trajectory.of(state, time, goal, commands, diverged=has_diverged(state))
+            running = metrics.update(running, row, config.scenario.termination_distance, limits, plant.leader)
         seen = [truth(state, plant.leader), measured] if plant.leader < follower else [measured, truth(state, 1)]
         given = np.stack([see(own, mount, goal) for own, mount in zip(seen, mounts, strict=True)], axis=1)
         given = np.concatenate([given, command], axis=-1)

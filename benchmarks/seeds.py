@@ -36,7 +36,7 @@ import numpy as np
 
 import cells
 import stability
-from batch import Batch
+from batch import fly_compiled
 from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
 from mjxball.arrays import Array
@@ -147,9 +147,8 @@ class Single(Stacked):
 
 def fly(config: Config, policies: list[Policy], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
     """Metrics of every policy in every scenario."""
-    batch, count = Batch(config, policies[0]), len(scenarios)
-    batch._law = Stacked(policies)
-    flown = batch.fly(list(scenarios) * len(policies))
+    count = len(scenarios)
+    flown = fly_compiled(config, policies[0], list(scenarios) * len(policies), law=Stacked(policies))
     return [flown[first : first + count] for first in range(0, len(flown), count)]
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from batch import Batch
+from batch import fly_compiled
 from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball.baselines import make_baseline
@@ -60,9 +60,9 @@ def teams(paths: Sequence[Path], named: Sequence[str], sizes: Sequence[int]) -> 
         ]
         farthest = {mass: _trimmed(config, mass) for mass in {cell.mass for cell in cells}}
         held = [cell for cell in cells if cell.amplitude * REACH[cell.path] <= farthest[cell.mass]]
-        references = {name: Batch(config, make_baseline(name, config)).fly(held) for name in REFERENCES}
+        references = {name: fly_compiled(config, make_baseline(name, config), held) for name in REFERENCES}
         for follower in _followers(config, paths, named):
-            found = references.get(follower.name) or Batch(config, follower).fly(held)
+            found = references.get(follower.name) or fly_compiled(config, follower, held)
             rows.append({"drones": count, "follower": follower.name, "cases": len(held), **_row(found, references)})
             say(rows[-1])
     return rows
