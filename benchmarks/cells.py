@@ -28,7 +28,7 @@ from typing import Any
 from batch import fly_compiled
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
-from mjxball.bench.success import PEAK, later
+from mjxball.bench.success import BOUNDS, Bound, limits
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
@@ -43,7 +43,7 @@ MASSES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 Cell = tuple[float, float, float]  # CG speed [rad/s], amplitude [m], mass [kg]
 EVERY: list[Cell] = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
 MARGIN, BELIEVED = 0.15, 0.2
-WANTED = ("peak", "overshoot", "settling", "rmse")
+WANTED = {"peak": BOUNDS["peak"], "overshoot": Bound(), "settling": BOUNDS["settling"], "rmse": Bound(0.005, 0.1)}
 EFFORT = ("rotors_at_limit", "rotor_power")  # see docs/metrics.md
 
 
@@ -95,12 +95,7 @@ def feasible(config: Config) -> list[Cell]:
 
 def wanted(adaptive: dict[str, float], lqg: dict[str, float]) -> dict[str, float]:
     """The largest numbers with which a cell is won."""
-    return {
-        "peak": adaptive["peak"] + PEAK,
-        "overshoot": adaptive["overshoot"],
-        "settling": float(later(lqg["settling"])),
-        "rmse": lqg["rmse"] + max(0.005, 0.1 * lqg["rmse"]),
-    }
+    return limits({**lqg, "peak": adaptive["peak"], "overshoot": adaptive["overshoot"]}, WANTED)
 
 
 def wins_of(mine: dict[str, float], bar: dict[str, float]) -> list[str]:
