@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.arrays import Array
-from mjxball.config import Plant
+from mjxball.config import Config, Plant
 from mjxball.rewards import paper_reward
-from mjxball.sim.rollout import Trajectory
+from mjxball.sim.rollout import Flights, Trajectory, simulate_batch
 from mjxball.sim.scenario import Scenario
 
 RMSE_UNTIL = 20.0  # [s]
@@ -60,9 +60,9 @@ class Metrics:
 class RunningMetrics(NamedTuple):
     """Sums and extremes of n flights so far, NumPy or JAX arrays (n,) unless said otherwise."""
 
-    steps: Array  # ()
-    time: Array  # () of the last step [s]
-    early: Array  # () steps within the first 20 s
+    steps: Array  # () or (n,)
+    time: Array  # () or (n,), of the last step [s]
+    early: Array  # () or (n,), steps within the first 20 s
     sums: Array  # (n, 9) over the steps of what `_taken` says
     excess: Array  # (n, 9) what rounding has added to them: it may always round the same way
     failed: Array
@@ -194,7 +194,7 @@ def results(running: RunningMetrics) -> list[Metrics]:
         goal = np.where(t.target == 0, np.nan, t.target)
         over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / np.abs(goal))
         settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
-        settled = np.where(t.outside >= t.time - NEVER_WITHIN - ROUNDING, np.nan, settled)
+        settled = np.where(t.outside >= (t.time - NEVER_WITHIN - ROUNDING)[..., None], np.nan, settled)
         columns = {
             "rmse": np.sqrt(square / t.early),
             "settling_time": settled[:, 0],
@@ -208,7 +208,7 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "settling_time_10": settled[:, 1],
             "paper_return": returned,
             "effort": np.sqrt(effort / t.steps),
-            "smoothness": np.sqrt(change / max(t.steps - 1, 1)),
+            "smoothness": np.sqrt(change / np.maximum(t.steps - 1, 1)),
             "saturation": saturated / t.steps,
             "rotors_at_limit": limited / t.steps,
             "rotor_power": power / t.steps / t.hover_power,
@@ -228,6 +228,13 @@ def rotor_limits(plant: Plant, scenarios: Sequence[Scenario]) -> np.ndarray:
     for number, scenario in enumerate(scenarios):
         found[number, [drone for drone, _ in scenario.lost]] = np.nan
     return found
+
+
+def fly_and_measure(config: Config, flights: Flights, physics: str = "mjx") -> tuple[Trajectory, list[Metrics]]:
+    """Every flight of `simulate_batch`, with its metrics."""
+    flown, scenarios = simulate_batch(config, flights, physics), [one for _, part in flights for one in part]
+    limit, most = config.scenario.termination_distance, rotor_limits(config.plant, scenarios)
+    return flown, measure_batch(flown, limit, most, config.plant.leader)
 
 
 def measure(
