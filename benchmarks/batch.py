@@ -19,7 +19,7 @@ from mjxball.policy import Policy
 from mjxball.policy.inference import NetworkLaw
 from mjxball.scalar_form import scalar_form
 from mjxball.sim.closed_loop import ClosedLoop
-from mjxball.sim.rollout import Carry, Inputs, arranged, control_step, make_privileged_info
+from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
@@ -38,7 +38,7 @@ def fly_compiled(
     controller, config_of = law or law_of(follower), (config.plant, config.attitude)
     if physics not in TRAINING_ENGINES:
         raise InputError(f"batches fly on {' or '.join(TRAINING_ENGINES)}, not on {physics}")
-    flown = arranged(config, scenarios)
+    flown = scenario_arrays(config, scenarios)
     enable_compilation_cache()
     engine = (mjx if physics == "mjx" else newton_euler).make_engine(*config_of)
     # Half of the time for hundreds of worlds; MJX and the cascade of a Crazyflie gain nothing, and compile longer.

@@ -172,7 +172,7 @@ def control_step(
     return Carry(moved, observation, memory), row
 
 
-class Flown(NamedTuple):
+class ScenarioArrays(NamedTuple):
     """Scenarios of one length as arrays of n flights: what `control_step` needs to fly them."""
 
     load: Load
@@ -183,7 +183,7 @@ class Flown(NamedTuple):
     delays: Int[np.ndarray, "n ..."]  # of the measurements, in control steps
 
 
-def arranged(config: Config, scenarios: Sequence[Scenario]) -> Flown:
+def scenario_arrays(config: Config, scenarios: Sequence[Scenario]) -> ScenarioArrays:
     """`scenarios`, checked, as arrays; InputError unless all last equally long."""
     scenarios = [check_scenario(config, scenario) for scenario in scenarios]
     if len({scenario.seconds for scenario in scenarios}) != 1:
@@ -196,7 +196,7 @@ def arranged(config: Config, scenarios: Sequence[Scenario]) -> Flown:
     # The time is exact, so that a mass change falls on the same row for every engine.
     inputs = Inputs(np.arange(steps) * period, target[:-1], target[1:], force, later)
     load, start = load_of(config, scenarios), start_of(config, scenarios)
-    return Flown(load, start, inputs, samples.at(0), *sensors_of(disturbances, period, followers))
+    return ScenarioArrays(load, start, inputs, samples.at(0), *sensors_of(disturbances, period, followers))
 
 
 def simulate(
@@ -227,12 +227,12 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     """
     validate(config)
     controller = _Together(flights)
-    flown = arranged(config, [scenario for _, part in flights for scenario in part])
+    flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
     privileged = make_privileged_info(config) if controller.informed else lambda *_: None
     on_pid, load, inputs = on_pid_of(flights), flown.load, flown.inputs
     loop = ClosedLoop(config, make_stepper(config, physics), flown.sensors)
     state, observation = loop.start(flown.start, inputs.goal[0], flown.first, flown.delays)
-    carry, plants, rows = Carry(state, observation, ()), [], []
+    carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
     for number in range(len(inputs.time)):
         plants.append(carry.loop.plant)
         carry, row = control_step(loop, controller, privileged, load, carry, inputs.at(number), on_pid)
