@@ -41,50 +41,20 @@ def fly(
 
     `laws`: one for all rigs, or R of one class, each made for its rig. In float32 on JAX's default device.
     """
-    size, one_rig = int(rigs.size[0]), dataclasses.replace(config.rigs, number=1)
+    one_rig = dataclasses.replace(config.rigs, number=1)
     # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own law.
     own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig)
-    env, disturbances = TransportEnv(own, "newton-euler"), RandomDisturbances(own)
-    limit, leader = config.scenario.termination_distance, own.plant.leader
+    env, period = TransportEnv(own, "newton-euler"), own.timing.control_period
     numbers: list[Any] | None = None
     if isinstance(laws, Sequence):
         numbers, rebuild = stacked(laws)
     else:
         alike: Law = laws
         rebuild = lambda _: alike  # noqa: E731
-    times = env.dt * np.arange(round(seconds / env.dt) + 1, dtype=np.float32)
-
-    def flight(key: Any, rig: RigTable, law: Law) -> RunningMetrics:
-        state = env.reset(key, None, rig)
-        world, observation = state.pipeline_state, state.obs[..., :OBSERVATION_SIZE]
-        parameters = whole(world.rig, own.plant.gravity)
-        physics = make_physics(own, "newton-euler", parameters)
-        loop = ClosedLoop(own, physics, disturbances.sensors, parameters)
-        if isinstance(law, AnyRigLaw):
-            law = law.on(rig, own.plant)
-
-        def privileged(plant: PlantState, load: Any) -> PrivilegedInfo:
-            return _privileged(plant, load, world.rig, size)
-
-        def step(carried: tuple[Carry, Any, RunningMetrics], time: Any) -> Any:
-            carry, random, running = carried
-            force = random.force if disturbances.present else None
-            random, sample = disturbances.step(random)
-            inputs, plant = Inputs(time, world.goal, world.goal, force, sample), carry.loop.plant
-            carry, row = control_step(loop, law, privileged, world.load, carry, inputs, 0.0)
-            most = rig.numbers.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
-            running = update(
-                running, jax.tree.map(lambda part: part[None], row)._replace(time=time), limit, most, leader
-            )
-            return (carry, random, running), None
-
-        plant = world.loop.plant
-        running = begin(plant.position[None], world.goal[None], plant.rotor_force[None], leader)
-        carry = Carry(world.loop, observation, law.start(observation))
-        return jax.lax.scan(step, (carry, world.disturbances, running), times)[0][2]
+    times = period * np.arange(round(seconds / period) + 1, dtype=np.float32)
 
     def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> RunningMetrics:
-        return jax.vmap(lambda key: flight(key, rig, rebuild(numbers)))(keys)
+        return jax.vmap(lambda key: _flight(env, key, rig, rebuild(numbers), times))(keys)
 
     keys = jax.random.split(jax.random.key(seed), (rigs.total, flights))
     single = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (rigs, numbers))
@@ -92,6 +62,36 @@ def fly(
     # (R, K, 1, ...), or (R, K) of what all flights of a batch share.
     found = results(jax.tree.map(lambda part: part.reshape(-1, *part.shape[3:]), running))
     return [found[first : first + flights] for first in range(0, len(found), flights)]
+
+
+def _flight(env: TransportEnv, key: Any, rig: RigTable, law: Law, times: np.ndarray) -> RunningMetrics:
+    """One flight of `rig` from a random start of `env`, over `times` [s], as a batch of one."""
+    config, state = env.config, env.reset(key, None, rig)
+    world, observation = state.pipeline_state, state.obs[..., :OBSERVATION_SIZE]
+    disturbances, parameters = RandomDisturbances(config), whole(world.rig, config.plant.gravity)
+    physics = make_physics(config, "newton-euler", parameters)
+    loop = ClosedLoop(config, physics, disturbances.sensors, parameters)
+    limit, leader = config.scenario.termination_distance, config.plant.leader
+    if isinstance(law, AnyRigLaw):
+        law = law.on(rig, config.plant)
+
+    def privileged(plant: PlantState, load: Any) -> PrivilegedInfo:
+        return _privileged(plant, load, world.rig, config.plant.count)
+
+    def step(carried: tuple[Carry, Any, RunningMetrics], time: Any) -> Any:
+        carry, random, running = carried
+        force = random.force if disturbances.present else None
+        random, sample = disturbances.step(random)
+        inputs, plant = Inputs(time, world.goal, world.goal, force, sample), carry.loop.plant
+        carry, row = control_step(loop, law, privileged, world.load, carry, inputs, 0.0)
+        most = rig.numbers.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
+        row = jax.tree.map(lambda part: part[None], row)._replace(time=time)
+        return (carry, random, update(running, row, limit, most, leader)), None
+
+    plant = world.loop.plant
+    running = begin(plant.position[None], world.goal[None], plant.rotor_force[None], leader)
+    carry = Carry(world.loop, observation, law.start(observation))
+    return jax.lax.scan(step, (carry, world.disturbances, running), times)[0][2]
 
 
 class AnyRigLaw(NetworkLaw):
