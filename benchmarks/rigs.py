@@ -43,7 +43,8 @@ from random_rigs import AnyRigLaw, fly, rig_laws
 from teams import effort_of
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
-WANTED = {"peak": Bound(0.005), "settling": Bound(relative=0.25)}  # peak [m] of a rig of the pair's length
+LATER, MORE = 1.25, 0.005  # settling, peak [m] of a rig of the pair's length
+WANTED = {"peak": Bound(MORE), "settling": Bound(relative=LATER - 1)}
 KNOWING = ("lqg-known-rig", "lqg-slow-known-rig")
 PAIR_LOAD = 0.2  # [kg]
 SHARES = ("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner")
