@@ -42,7 +42,8 @@ from mjxball.physics.engine import Load, PlantState, has_diverged
 from mjxball.physics.step import ControlStep, make_control_step
 from mjxball.plant import plant_parameters
 from mjxball.sim.closed_loop import Commands
-from mjxball.sim.rollout import Trajectory, scenario_arrays
+from mjxball.sim.rollout import scenario_arrays
+from mjxball.sim.trajectory import Trajectory
 from mjxball.train.run_directory import commit, versions
 
 PAIRS = ("pair", "pair-unknown")

@@ -20,8 +20,8 @@ from mjxball.evaluate.metrics import measure, rotor_limits
 from mjxball.evaluate.plots import PANELS, draw_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.plotting import SIMULATED, STYLES, file_format, style
-from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 from mjxball.terminal import warn
 from mjxfly.log_export import WRITERS
 from mjxfly.log_import import UNKNOWN

@@ -12,8 +12,9 @@ import numpy as np
 from mjxball.arrays import Array
 from mjxball.config import Config, Plant
 from mjxball.rewards import paper_reward
-from mjxball.sim.rollout import Flights, Trajectory, simulate_batch
+from mjxball.sim.rollout import Flights, simulate_batch
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 
 RMSE_UNTIL = 20.0  # [s]
 PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed

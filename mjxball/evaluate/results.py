@@ -16,8 +16,8 @@ from mjxball import terminal
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics, fly_and_measure
-from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario, of_plant
+from mjxball.sim.trajectory import Trajectory
 
 RESULTS = "cells.json"  # in the output directory
 # The metrics in `--json`, a fixed format; a benchmark's scores have all of them.

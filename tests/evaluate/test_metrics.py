@@ -11,8 +11,8 @@ import pytest
 
 from mjxball.config import preset
 from mjxball.evaluate.metrics import Metrics, begin, measure, measure_batch, results, rotor_limits, update
-from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 
 TIME = np.arange(1501) * 0.02  # 30 s
 GOAL = np.array([1.0, -2.0, 0.0])

@@ -13,8 +13,9 @@ from mjxball.config import replace
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.physics.step import make_stepper
-from mjxball.sim.rollout import Trajectory, load_of, simulate, simulate_batch, start_of
+from mjxball.sim.rollout import load_of, simulate, simulate_batch, start_of
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 
 CASES = {
     "sine": (paper_with(), Scenario(omega=1.0, seconds=2.5)),
