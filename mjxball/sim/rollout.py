@@ -139,8 +139,8 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     validate(config)
     controller = _Together(flights)
     flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
-    privileged = make_privileged_info(config) if controller.informed else lambda *_: None
-    on_pid, load, inputs = on_pid_of(flights), flown.load, flown.inputs
+    on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
+    privileged = make_privileged_info(config) if not on_pid.all() else lambda *_: None
     loop = ClosedLoop(config, make_stepper(config, physics), flown.sensors)
     state, observation = loop.start(flown.start, inputs.goal[0], flown.first, flown.delays)
     carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
@@ -178,7 +178,8 @@ class _Together:
                     f"{name} is a law; mjxball.control.followers.Baseline({name}(config), config) flies it"
                 )
             follower.reset()
-        self.informed = any(isinstance(follower, Baseline) for follower, _ in self._followers)
+        # 1 for every flight of a policy, whose base is the leader's whole PID; 0 for one of a baseline.
+        self.on_pid = np.array([1.0 - isinstance(follower, Baseline) for follower, part in flights for _ in part])
 
     def start(self, observation: np.ndarray) -> tuple[()]:
         """Nothing: the followers remember themselves."""
@@ -193,11 +194,6 @@ class _Together:
             seen = observation[part]
             commands.append(checked_command(getattr(follower, "name", type(follower).__name__), follower(seen), seen))
         return state, np.concatenate(commands)
-
-
-def on_pid_of(flights: Flights) -> Float[np.ndarray, " n"]:
-    """1.0 for every flight whose follower's base is the leader's whole PID law: a policy, not a baseline."""
-    return np.array([0.0 if isinstance(follower, Baseline) else 1.0 for follower, part in flights for _ in part])
 
 
 def make_privileged_info(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
