@@ -47,7 +47,7 @@ class Mark(NamedTuple):
 
 
 def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
-    """What is shown of a `Trajectory`, and the shape of a row."""
+    """What is shown of a `rollout.Trajectory`, and the shape of a row."""
     drones, followers = plant.count, plant.count - 1
     return {
         "time": (),
@@ -67,7 +67,7 @@ def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class Flight:
-    """One flight of T rows: arrays (T, ...) in SI units, named and laid out as in `Trajectory`.
+    """One flight of T rows: arrays (T, ...) in SI units, named and laid out as in `rollout.Trajectory`.
 
     `hidden` (T, [followers,] H), the state of the followers' GRU after each row, is there if it was asked for.
     """
