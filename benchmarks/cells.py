@@ -25,10 +25,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from batch import Batch
+from batch import fly_compiled
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
-from mjxball.bench.success import PEAK, later
+from mjxball.bench.success import BOUNDS, Bound, limits
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
@@ -36,6 +36,7 @@ from mjxball.control.followers import Follower
 from mjxball.evaluate.policies import load_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
+from stability import peak
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 AMPLITUDES = (0.05, 0.10, 0.17)
@@ -43,15 +44,14 @@ MASSES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 Cell = tuple[float, float, float]  # CG speed [rad/s], amplitude [m], mass [kg]
 EVERY: list[Cell] = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
 MARGIN, BELIEVED = 0.15, 0.2
-WANTED = ("peak", "overshoot", "settling", "rmse")
+WANTED = {"peak": BOUNDS["peak"], "overshoot": Bound(), "settling": BOUNDS["settling"], "rmse": Bound(0.005, 0.1)}
 EFFORT = ("rotors_at_limit", "rotor_power")  # see docs/metrics.md
 
 
 def numbers_of(metrics: Any) -> dict[str, float]:
     """What a cell is evaluated by; infinite for a flight that never settled."""
-    peaks = (metrics.x_peak, metrics.y_peak, metrics.z_peak)
     settling = math.inf if metrics.settling_time is None else metrics.settling_time
-    return {"peak": max(peaks), "overshoot": metrics.overshoot, "settling": settling, "rmse": metrics.rmse}
+    return {"peak": peak(metrics), "overshoot": metrics.overshoot, "settling": settling, "rmse": metrics.rmse}
 
 
 def scenarios_of(cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Scenario]:
@@ -80,7 +80,7 @@ def medians(flown: list[Any], cells: int) -> list[Row]:
 
 def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Any]:
     """`medians` of a follower's flights."""
-    return medians(Batch(preset("paper"), follower).fly(scenarios_of(cells, common, disturbed, seeds)), len(cells))
+    return medians(fly_compiled(preset("paper"), follower, scenarios_of(cells, common, disturbed, seeds)), len(cells))
 
 
 def reach_of(config: Config, mass: float, known: bool) -> float:
@@ -95,12 +95,7 @@ def feasible(config: Config) -> list[Cell]:
 
 def wanted(adaptive: dict[str, float], lqg: dict[str, float]) -> dict[str, float]:
     """The largest numbers with which a cell is won."""
-    return {
-        "peak": adaptive["peak"] + PEAK,
-        "overshoot": adaptive["overshoot"],
-        "settling": float(later(lqg["settling"])),
-        "rmse": lqg["rmse"] + max(0.005, 0.1 * lqg["rmse"]),
-    }
+    return limits({**lqg, "peak": adaptive["peak"], "overshoot": adaptive["overshoot"]}, WANTED)
 
 
 def wins_of(mine: dict[str, float], bar: dict[str, float]) -> list[str]:

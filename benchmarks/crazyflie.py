@@ -76,7 +76,7 @@ def stand(path: Path, starts: int) -> list[Row]:
                 "ball rms": rms(ball[late]),
                 "roll rms": rms(flown.euler[late, :, 0]),
                 "height rms": rms(flown.error[late, :, 2]),
-                "diverged": int(flown.diverged.sum()),
+                "diverged": int(flown.diverged[-1].sum()),
             }
         )
     return rows

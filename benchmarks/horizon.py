@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from batch import Batch
+from batch import fly_compiled
 from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball import config as configs
@@ -77,10 +77,10 @@ def own_scenarios(setup: Config, seconds: float) -> list[Scenario]:
 
 def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> list[Row]:
     """One row for each scenario and horizon [s], the shortest first."""
-    batch, rows, first = Batch(setup, load_policy(path, setup)), [], []
+    policy, rows, first = load_policy(path, setup), [], []
     for seconds in horizons:
-        scenarios = own_scenarios(setup, seconds)
-        found, shorter = batch.fly(scenarios), batch.fly(own_scenarios(setup, seconds - LAST))
+        scenarios, lengths = own_scenarios(setup, seconds), (seconds, seconds - LAST)
+        found, shorter = (fly_compiled(setup, policy, own_scenarios(setup, length)) for length in lengths)
         first = first or found
         period = setup.timing.control_period
         rows_of_flight = round(seconds / period) + 1, round(LAST / period)

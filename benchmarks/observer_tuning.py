@@ -28,15 +28,14 @@ from typing import Any
 
 import numpy as np
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball.baselines import Mpc, Observer, Pid
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.followers import Baseline
-from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
+from mjxball.evaluate.metrics import Metrics, fly_and_measure
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import CgPath, Scenario
 from stability import MARGIN, peak, random_scenarios
 
@@ -114,9 +113,9 @@ def costs_of(
 ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """(cost (S,), medians (S,) under each condition) of `law`, which flies all `drawn` with each of `sets`."""
     config = preset("paper")
-    batch, total, shown = Batch(config, Baseline(law, config)), np.zeros(sets), []
+    total, shown = np.zeros(sets), []
     flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn * sets]
-    flown = batch.fly(flights)
+    flown = fly_compiled(config, Baseline(law, config), flights)
     for runs in (flown[: len(flights) // 2], flown[len(flights) // 2 :]):
         total += cost_of(runs, allowed).reshape(sets, -1).mean(axis=1)
         shown.append(medians(runs, sets))
@@ -139,9 +138,8 @@ def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarr
     for config, drawn in of_teams():
         flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn]
         laws = [type("Tuned", (Mpc,), {"team_tuning": tuned(Mpc.team_tuning, values)})(config) for values in sets]
-        flown = simulate_batch(config, [(Baseline(law, config), flights) for law in laws], "newton-euler")
-        limit, most = config.scenario.termination_distance, rotor_limits(config.plant, flights * len(sets))
-        found = iter(measure_batch(flown, limit, most, config.plant.leader))
+        _, measured = fly_and_measure(config, [(Baseline(law, config), flights) for law in laws], "newton-euler")
+        found = iter(measured)
         for number in range(len(sets)):
             for of_condition in runs:
                 of_condition[number] += itertools.islice(found, TEAM_FLIGHTS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,43 +14,19 @@ import numpy as np
 from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
 from mjxball.control.geometry import team_geometry
-from mjxball.env import PipelineState, State, TransportEnv
-from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, SETTLED, STEADY_AFTER, near_limit, power_of
+from mjxball.control.observation import OBSERVATION_SIZE
+from mjxball.env import TransportEnv, make_physics
+from mjxball.evaluate.metrics import Metrics, RunningMetrics, begin, results, update
+from mjxball.physics.engine import PlantState
 from mjxball.physics.motion import object_mass
+from mjxball.plant import PlantParameters
 from mjxball.policy.inference import NetworkLaw
-from mjxball.sim.rigs import RigTable, rig_config
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.disturbances import RandomDisturbances
+from mjxball.sim.rigs import RigTable, rig_config, whole
+from mjxball.sim.rollout import Carry, Inputs, control_step
 
 SECONDS = 30.0  # of a flight
-
-
-class Effort(NamedTuple):
-    """What flights of R rigs, K each, cost; all (R, K)."""
-
-    at_limit: Any  # share of the steps in which any rotor is within 1 % of 0 or of its largest force
-    tilt_spread: Any  # rms of the followers' roll and pitch less their mean; 0 of a pair [rad]
-    lift_spread: Any  # of their vertical command [m/s2]
-    power: Any  # mean of sum F^1.5 over all rotors, over that of rotors which share the weight evenly
-
-
-class Flown(NamedTuple):
-    """Flights of R rigs, K each."""
-
-    error: Float[np.ndarray, "R K T"]  # |e_o| at every control step, the start first [m]
-    failed: Bool[np.ndarray, "R K"]  # it left scenario.termination_distance, or diverged
-    effort: Effort | None = None
-
-    def settling(self, period: float) -> Float[np.ndarray, "R K"]:
-        """Last time at which the error exceeds 2 % of the first one [s]; inf: it never settles."""
-        late = self.error > SETTLED[0] * self.error[..., :1]
-        last = self.error.shape[-1] - 1 - late[..., ::-1].argmax(axis=-1)
-        return np.where(self.failed | (last > self.error.shape[-1] - 6), np.inf, period * last)
-
-    def peak(self, period: float) -> Float[np.ndarray, "R K"]:
-        """Largest error after 20 s [m]; inf of a flight that failed."""
-        return np.where(self.failed, np.inf, self.error[..., round(STEADY_AFTER / period) :].max(axis=-1))
 
 
 def fly(
@@ -60,69 +36,62 @@ def fly(
     flights: int = 3,
     seconds: float = SECONDS,
     seed: int = 0,
-) -> Flown:
-    """Fly `flights` random flights of every rig (R) of one size, the same ones for every follower.
+) -> list[list[Metrics]]:
+    """Metrics of `flights` random flights of every rig (R) of one size, the same ones for every follower.
 
     `laws`: one for all rigs, or R of one class, each made for its rig. In float32 on JAX's default device.
     """
-    size, one_rig = int(rigs.size[0]), dataclasses.replace(config.rigs, number=1)
+    one_rig = dataclasses.replace(config.rigs, number=1)
     # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own law.
     own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig)
-    env = TransportEnv(own, "newton-euler")
+    env, period = TransportEnv(own, "newton-euler"), own.timing.control_period
     numbers: list[Any] | None = None
     if isinstance(laws, Sequence):
         numbers, rebuild = stacked(laws)
     else:
         alike: Law = laws
         rebuild = lambda _: alike  # noqa: E731
-    steps = round(seconds / env.dt)
+    times = period * np.arange(round(seconds / period) + 1, dtype=np.float32)
 
-    def flight(key: Any, rig: RigTable, law: Law) -> Any:
-        state = env.reset(key, None, rig)
-
-        def step(carry: tuple[State, Any, Any, Any], _: Any) -> Any:
-            state, memory, far, effort = carry
-            world = state.pipeline_state
-            error = jnp.linalg.norm(world.goal - world.loop.plant.position)
-            far = far | (error > config.scenario.termination_distance) | world.loop.diverged
-            memory, command = law.step(memory, state.obs[..., :18], _privileged(world, size))
-            state = env.step_with_command(state, command)
-            effort = jax.tree.map(jnp.add, effort, _effort(state.pipeline_state, command, rig, own.plant.gravity))
-            return (state, memory, far, effort), error
-
-        if isinstance(law, AnyRigLaw):
-            law = law.on(rig, own.plant)
-        nothing = Effort(*(jnp.zeros(()) for _ in Effort._fields))
-        start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool), nothing)
-        (_, _, far, effort), error = jax.lax.scan(step, start, None, steps + 1)
-        mean = jax.tree.map(lambda total: total / (steps + 1), effort)
-        return error, far, mean._replace(tilt_spread=jnp.sqrt(mean.tilt_spread), lift_spread=jnp.sqrt(mean.lift_spread))
-
-    def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> Any:
-        return jax.vmap(lambda key: flight(key, rig, rebuild(numbers)))(keys)
+    def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> RunningMetrics:
+        return jax.vmap(lambda key: _flight(env, key, rig, rebuild(numbers), times))(keys)
 
     keys = jax.random.split(jax.random.key(seed), (rigs.total, flights))
     single = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (rigs, numbers))
-    error, failed, effort = jax.tree.map(np.asarray, jax.jit(jax.vmap(rig_flights))(*single, keys))
-    return Flown(error, failed, effort)
+    running = jax.jit(jax.vmap(rig_flights))(*single, keys)
+    # (R, K, 1, ...), or (R, K) of what all flights of a batch share.
+    found = results(jax.tree.map(lambda part: part.reshape(-1, *part.shape[3:]), running))
+    return [found[first : first + flights] for first in range(0, len(found), flights)]
 
 
-def _effort(world: PipelineState, command: Any, rig: RigTable, gravity: float) -> Effort:
-    """Of one step, squares in place of roots; `command` (3,) or (followers, 3)."""
-    size = len(rig.numbers.mounts)
-    force = world.loop.plant.rotor_force
-    fade = 1.0 - rig.thrust_fade * world.loop.plant.time
-    most = (rig.numbers.rotor_force_max * rig.thrust * fade)[:, None]
-    weight = gravity * (rig.numbers.drone_mass.sum() + rig.numbers.carrier_mass + rig.object_mass)
-    even = power_of(jnp.broadcast_to(weight / (4 * size), force.shape))
-    apart = jnp.atleast_2d(command)
-    apart = (apart - apart.mean(axis=0)) ** 2
-    return Effort(
-        at_limit=near_limit(AT_LIMIT_WITHIN, force, most).max(),
-        tilt_spread=apart[:, :2].mean(),
-        lift_spread=apart[:, 2].mean(),
-        power=power_of(force) / even,
-    )
+def _flight(env: TransportEnv, key: Any, rig: RigTable, law: Law, times: np.ndarray) -> RunningMetrics:
+    """One flight of `rig` from a random start of `env`, over `times` [s], as a batch of one."""
+    config, state = env.config, env.reset(key, None, rig)
+    world, observation = state.pipeline_state, state.obs[..., :OBSERVATION_SIZE]
+    disturbances, parameters = RandomDisturbances(config), whole(world.rig, config.plant.gravity)
+    physics = make_physics(config, "newton-euler", parameters)
+    loop = ClosedLoop(config, physics, disturbances.sensors, parameters)
+    limit, leader = config.scenario.termination_distance, config.plant.leader
+    if isinstance(law, AnyRigLaw):
+        law = law.on(rig, config.plant)
+
+    def privileged(plant: PlantState, load: Any) -> PrivilegedInfo:
+        return _privileged(plant, load, world.rig, config.plant.count)
+
+    def step(carried: tuple[Carry, Any, RunningMetrics], time: Any) -> Any:
+        carry, random, running = carried
+        force = random.force if disturbances.present else None
+        random, sample = disturbances.step(random)
+        inputs, plant = Inputs(time, world.goal, world.goal, force, sample), carry.loop.plant
+        carry, row = control_step(loop, law, privileged, world.load, carry, inputs, 0.0)
+        most = rig.numbers.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
+        row = jax.tree.map(lambda part: part[None], row)._replace(time=time)
+        return (carry, random, update(running, row, limit, most, leader)), None
+
+    plant = world.loop.plant
+    running = begin(plant.position[None], world.goal[None], plant.rotor_force[None], leader)
+    carry = Carry(world.loop, observation, law.start(observation))
+    return jax.lax.scan(step, (carry, world.disturbances, running), times)[0][2]
 
 
 class AnyRigLaw(NetworkLaw):
@@ -156,14 +125,13 @@ def stacked(laws: Sequence[Law]) -> tuple[list[Any], Callable[[list[Any]], Law]]
     return numbers, rebuild
 
 
-def _privileged(world: PipelineState, size: int) -> PrivilegedInfo:
+def _privileged(plant: PlantState, load: Any, rig: PlantParameters, size: int) -> PrivilegedInfo:
     """What a classical follower may know of its world; nothing of where the CG is."""
-    load: Any = world.load
-    mass = object_mass(world.loop.plant.time, load)
+    mass = object_mass(plant.time, load)
     thrust = load.thrust_scale
     if load.thrust_fade is not None:
-        thrust = thrust * (1.0 - load.thrust_fade * world.loop.plant.time)
-    total = world.rig.drone_mass.sum() + world.rig.carrier_mass + mass
+        thrust = thrust * (1.0 - load.thrust_fade * plant.time)
+    total = rig.drone_mass.sum() + rig.carrier_mass + mass
     zero = jnp.zeros(2)
     known = PrivilegedInfo(load.believed_mass, zero, zero, total, thrust)
     if size == 2:

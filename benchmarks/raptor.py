@@ -41,8 +41,9 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
 from mjxball.physics.step import ControlStep, make_control_step
 from mjxball.plant import plant_parameters
-from mjxball.sim.disturbances import record, sensors_of
-from mjxball.sim.rollout import Tick, load_of, start_of
+from mjxball.sim.closed_loop import Commands
+from mjxball.sim.rollout import scenario_arrays
+from mjxball.sim.trajectory import Trajectory
 from mjxball.train.run_directory import commit, versions
 
 PAIRS = ("pair", "pair-unknown")
@@ -91,11 +92,8 @@ def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
     timing = dataclasses.replace(world.config.timing, control_period=PERIOD, physics_steps=STEPS)
     config = dataclasses.replace(world.config, plant=plant, timing=timing)
     step, most = _rotor_step(config), np.array(plant.of_drones("rotor_force_max"))[:, None]
-    count = round(scenarios[0].seconds / PERIOD)
-    disturbances = [scenario.disturbance for scenario in scenarios]
-    samples, (sensors, delays) = record(disturbances, count + 2, PERIOD), sensors_of(disturbances, PERIOD)
-    load, state = load_of(config, scenarios), start_of(config, scenarios)
-    goal = np.array([scenario.goal for scenario in scenarios], float)
+    flown = scenario_arrays(config, scenarios)
+    state, inputs, goal = flown.start, flown.inputs, flown.inputs.goal[0]
     mounts = np.array(plant_parameters(plant, config.attitude).mounts, float)
 
     def truth(state: PlantState, drone: int) -> np.ndarray:
@@ -104,24 +102,21 @@ def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
 
     raptor.reset()
     follower, nothing = plant.followers[0], np.zeros((len(goal), 3))
-    sensed, measured = sensors.start(truth(state, follower), samples.at(0), delays)
+    sensed, measured = flown.sensors.start(truth(state, follower), flown.first, flown.delays)
     running = metrics.begin(state.position, goal, state.rotor_force, plant.leader)
+    limits = metrics.rotor_limits(plant, scenarios)
     command = 2 * np.clip(state.rotor_force / most, 0.0, 1.0) - 1
-    for number in range(count + 1):
+    for number, time in enumerate(inputs.time):
         if number % 2 == 0:  # the 50 Hz of every other follower's flights
-            matrix = rotations.matrix_from_quaternion(state.quaternion)
-            euler = rotations.euler_from_matrix(matrix)
-            flown = (number * PERIOD, state.position, goal, euler, state.rotor_force, nothing, nothing)
-            tick = Tick(*flown, diverged=np.asarray(has_diverged(state)))
-            limits = metrics.rotor_limits(plant, scenarios)
-            running = metrics.update(running, tick, config.scenario.termination_distance, limits, plant.leader)
+            row = Trajectory.of(state, time, goal, Commands(nothing, nothing), diverged=has_diverged(state))
+            running = metrics.update(running, row, config.scenario.termination_distance, limits, plant.leader)
         seen = [truth(state, plant.leader), measured] if plant.leader < follower else [measured, truth(state, 1)]
         given = np.stack([see(own, mount, goal) for own, mount in zip(seen, mounts, strict=True)], axis=1)
         given = np.concatenate([given, command], axis=-1)
         answer = raptor.evaluate_step(given.reshape(-1, given.shape[-1]))
         command = np.clip(answer, -1.0, 1.0).reshape(command.shape)
-        state = step(state, most * ((command + 1) / 2), load)
-        sensed, measured = sensors.step(sensed, truth(state, follower), samples.at(number + 1))
+        state = step(state, most * ((command + 1) / 2), flown.load)
+        sensed, measured = flown.sensors.step(sensed, truth(state, follower), inputs.sample.at(number))
     return metrics.results(running)
 
 

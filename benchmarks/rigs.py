@@ -28,19 +28,23 @@ import numpy as np
 from harness import Row, arguments, say, table, write
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
+from mjxball.bench.success import Bound, limits, numbers
 from mjxball.bench.tracks import RIG_LENGTH
 from mjxball.cli import run_command
 from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
+from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import flies_any_rig, load_policy
 from mjxball.policy import Policy
 from mjxball.policy.inference import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_config, unpadded
-from random_rigs import AnyRigLaw, Flown, fly, rig_laws
+from random_rigs import AnyRigLaw, fly, rig_laws
+from teams import effort_of
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
-LATER, MORE = 1.25, 0.005  # the bar: settling, peak [m] of a rig of the pair's length
+LATER, MORE = 1.25, 0.005  # settling, peak [m] of a rig of the pair's length
+WANTED = {"peak": Bound(MORE), "settling": Bound(relative=LATER - 1)}
 KNOWING = ("lqg-known-rig", "lqg-slow-known-rig")
 PAIR_LOAD = 0.2  # [kg]
 SHARES = ("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner")
@@ -82,19 +86,18 @@ def _adaptive(config: Config) -> Law:
 
 def compare(config: Config, options: Any) -> dict[str, Any]:
     """Every follower on held-out rigs of all sizes, and the shares of rigs that are met."""
-    period, rows = config.timing.control_period, []
-    whole: dict[str, list[Row]] = {}
+    rows, whole = list[Row](), dict[str, list[Row]]()
     for size in options.sizes:
         drawn = draw_rigs(config, size, options.rigs, options.seed)
         rigs = unpadded(drawn.rigs, size)
-        flown: dict[str, Flown] = {}
+        flown: dict[str, list[list[Metrics]]] = {}
         for name, make in followers(options.policies):
             begun = time.perf_counter()
             flown[name] = fly(config, rigs, make(config, rigs), FLIGHTS)
             seconds = round(time.perf_counter() - begun, 1)
             # Rows of the two LQGs are complete once both have flown.
             for known in {KNOWING[0]: (), KNOWING[1]: KNOWING}.get(name, (name,)):
-                row = {"drones": size, "follower": known, **row_of(flown, known, rigs, period)}
+                row = {"drones": size, "follower": known, **row_of(flown, known, rigs)}
                 whole.setdefault(known, []).append(row)
                 rows.append({**row, "seconds": seconds})
                 say(rows[-1], ".3g")
@@ -108,33 +111,24 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
     return {"rows": rows, "all": shares}
 
 
-def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> Row:
+def row_of(flown: dict[str, list[list[Metrics]]], name: str, rigs: RigTable) -> Row:
     """Shares of failed flights, medians over rigs, and the shares of rigs that are met."""
-    settling, peak = (np.median(getattr(flown[name], part)(period), axis=1) for part in ("settling", "peak"))
+    medians = {who: np.median([[numbers(one) for one in own] for own in flown[who]], axis=1) for who in flown}
+    peak, settling, _ = medians[name].T
     row = {
-        "failed": float(flown[name].failed.mean()),
+        "failed": float(_failed(flown[name]).mean()),
         "unsettled": float(np.isinf(settling).mean()),
         **{f"settling_{q}": _quantile(settling, q) for q in (50, 90)},
         **{f"peak_{q}": _quantile(peak, q) for q in (50, 90)},
+        **effort_of([one for own in flown[name] for one in own]),
     }
-    effort = flown[name].effort
-    if effort is not None:
-        row |= {"at_limit": float(effort.at_limit.mean())}
-        for part in ("tilt_spread", "lift_spread", "power"):
-            of_rig = np.median(getattr(effort, part), axis=1)
-            row |= {f"{part}_{q}": _quantile(of_rig, q) for q in (50, 90)}
     if not set(KNOWING) <= flown.keys():
         return row
-    knowing = [flown[one] for one in KNOWING]
-    theirs = {
-        part: np.array([np.median(getattr(one, part)(period), axis=1) for one in knowing])
-        for part in ("settling", "peak")
-    }
-    more = MORE * np.maximum(rigs.length / RIG_LENGTH, 1.0)
-    best, smallest = (theirs[part].min(axis=0) for part in ("settling", "peak"))
-    soon = (settling <= LATER * best) | np.isinf(best)
-    small = (peak <= smallest + more) | np.isinf(smallest)
-    alone = flown[name].failed & ~np.all([one.failed for one in knowing], axis=0)
+    smallest, soonest, _ = np.min([medians[one] for one in KNOWING], axis=0).T
+    length = np.maximum(rigs.length / RIG_LENGTH, 1.0)
+    most = limits({"peak": smallest, "settling": soonest}, WANTED, length)
+    small, soon = peak <= most["peak"], settling <= most["settling"]
+    alone = _failed(flown[name]) & ~np.all([_failed(flown[one]) for one in KNOWING], axis=0)
     return {
         **row,
         "crashed_alone": float(alone.mean()),
@@ -142,8 +136,12 @@ def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) ->
         "soon": float(soon.mean()),
         "small": float(small.mean()),
         "met": float((soon & small).mean()),
-        "sooner": float((settling < best).mean()),
+        "sooner": float((settling < soonest).mean()),
     }
+
+
+def _failed(flown: list[list[Metrics]]) -> np.ndarray:
+    return np.array([[one.failed for one in own] for own in flown])
 
 
 def _quantile(values: np.ndarray, share: int) -> float | None:

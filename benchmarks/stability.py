@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from batch import Batch, law_of
+from batch import fly_compiled, law_of
 from harness import Row, arguments, say, table, write
 from mjxball.arrays import Array
 from mjxball.baselines import make_baseline
@@ -158,8 +158,8 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
         past = jnp.concatenate([loop.observe(plant, goal)[None], older])
         sensors = SensorState(delay, (), past) if delay else SensorState()
         state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
-        memory, answer = law.step(memory, past[-1], privileged(plant, load))
-        moved, _, _ = loop.step(state, past[-1], answer, load, (goal, goal), Sample(), 0.0)
+        carry, inputs = rollout.Carry(state, past[-1], memory), rollout.Inputs(zero, goal, goal, None, Sample())
+        (moved, _, memory), _ = rollout.control_step(loop, law, privileged, load, carry, inputs, 0.0)
         older = moved.sensors.past[1:] if delay else older
         # A flight that diverged stays where it was, which is no hover.
         return jnp.where(moved.diverged, jnp.nan, flat(moved.plant, memory, older)[0])
@@ -275,7 +275,7 @@ def main(given: Sequence[str] | None = None) -> int:
     table(shown)
     table([row for row in rows if not row["stable"]], ("follower", "offset", "mass", "radius"))
     scenarios = random_scenarios(config, options.flights, options.unknown, options.seed)
-    flown = Batch(config, policy).fly(scenarios)
+    flown = fly_compiled(config, policy, scenarios)
     peaks = [peak(metrics) for metrics in flown]
     failed = sum(metrics.failed for metrics in flown)
     middle, high, most = map(float, np.quantile(peaks, [0.5, 0.99, 1.0]))

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from batch import Batch
+from batch import fly_compiled
 from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball.baselines import make_baseline
-from mjxball.bench.success import LATER, PEAK
+from mjxball.bench.success import Bound, limits
 from mjxball.config import Config, preset
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics
@@ -33,7 +33,8 @@ from mjxball.sim.scenario import CIRCLE, CgPath, Scenario
 SIZES, SPEEDS, AMPLITUDES, MASSES = (2, 3, 4, 5, 6), (0.31, 1.0, 2.0, 3.1), (0.15, 0.3, 0.6), (0.5, 1.0, 1.5)
 EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
 REACH = {CIRCLE: 1.0, EIGHT: math.hypot(1.0, EIGHT.width)}  # farthest CG over the amplitude
-REFERENCES = ("adaptive", "lqg")  # the bar: peak of the first, settling of the second
+REFERENCES = ("adaptive", "lqg")  # of the peak, of settling
+WANTED = {"plane_peak": Bound(0.003), "settling_time": Bound(relative=0.1), "settling_time_10": Bound(relative=0.1)}
 ENGINE = "newton-euler"
 
 
@@ -60,9 +61,9 @@ def teams(paths: Sequence[Path], named: Sequence[str], sizes: Sequence[int]) -> 
         ]
         farthest = {mass: _trimmed(config, mass) for mass in {cell.mass for cell in cells}}
         held = [cell for cell in cells if cell.amplitude * REACH[cell.path] <= farthest[cell.mass]]
-        references = {name: Batch(config, make_baseline(name, config)).fly(held) for name in REFERENCES}
+        references = {name: fly_compiled(config, make_baseline(name, config), held) for name in REFERENCES}
         for follower in _followers(config, paths, named):
-            found = references.get(follower.name) or Batch(config, follower).fly(held)
+            found = references.get(follower.name) or fly_compiled(config, follower, held)
             rows.append({"drones": count, "follower": follower.name, "cases": len(held), **_row(found, references)})
             say(rows[-1])
     return rows
@@ -75,7 +76,8 @@ def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> Row:
         values = [None if run.failed else getattr(run, name) for run in runs]
         return np.array([math.inf if value is None else value for value in values])
 
-    small = of("plane_peak") <= of("plane_peak", references["adaptive"]) + PEAK
+    best = {name: of(name, references["adaptive" if name == "plane_peak" else "lqg"]) for name in WANTED}
+    small, soon, soon_10 = (of(name) <= most for name, most in limits(best, WANTED).items())
     row = {
         "failed": sum(run.failed for run in found),
         "plane_peak_median": float(np.median(of("plane_peak"))),
@@ -86,10 +88,8 @@ def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> Row:
         "small_peak": float(small.mean()),
         **effort_of(found),
     }
-    for label, name in (("", "settling_time"), ("_10", "settling_time_10")):
-        told = of(name, references["lqg"])
-        soon = np.where(np.isfinite(told), of(name) <= (1 + LATER) * told, True)
-        row |= {f"soon{label}": float(soon.mean()), f"both{label}": float((small & soon).mean())}
+    for label, early in (("", soon), ("_10", soon_10)):
+        row |= {f"soon{label}": float(early.mean()), f"both{label}": float((small & early).mean())}
     return row
 
 

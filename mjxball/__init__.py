@@ -17,13 +17,14 @@ __all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]
 
 if TYPE_CHECKING:
     from mjxball.policy import Policy
-    from mjxball.sim.rollout import Trajectory, simulate
+    from mjxball.sim.rollout import simulate
     from mjxball.sim.scenario import Scenario
+    from mjxball.sim.trajectory import Trajectory
 
 _MODULES = {
     "Policy": "mjxball.policy",
     "Scenario": "mjxball.sim.scenario",
-    "Trajectory": "mjxball.sim.rollout",
+    "Trajectory": "mjxball.sim.trajectory",
     "simulate": "mjxball.sim.rollout",
 }
 

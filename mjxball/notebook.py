@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 
 from mjxball.config import Plant
-from mjxball.sim.rollout import Trajectory
+from mjxball.sim.trajectory import Trajectory
 from mjxball.view.flight import flight_of
 from mjxball.view.page import flight_page
 

@@ -20,8 +20,8 @@ from mjxball.evaluate.metrics import measure, rotor_limits
 from mjxball.evaluate.plots import PANELS, draw_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.plotting import SIMULATED, STYLES, file_format, style
-from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 from mjxball.terminal import warn
 from mjxfly.log_export import WRITERS
 from mjxfly.log_import import UNKNOWN
@@ -92,9 +92,7 @@ def result_of(recording: Recording, name: str) -> Result:
 
 
 def trajectory_of(recording: Recording) -> Trajectory:
-    """A recording as a trajectory; quantities that were not measured are NaN."""
-    rows = len(recording.time)
-    unknown = np.full((rows, 2, 3), np.nan)
+    """A recording as a trajectory."""
     return Trajectory(
         time=recording.time,
         position=recording.position,
@@ -107,12 +105,8 @@ def trajectory_of(recording: Recording) -> Trajectory:
         follower_command=recording.follower,
         observation=recording.observation,
         cg_offset=recording.cg_offset,
-        object_mass=np.full(rows, np.nan),
-        contact_force=unknown,
-        contact_torque=unknown,
-        goal=recording.goal[max(recording.guided_rows - 1, 0)],
         target=recording.target,
-        diverged=np.array(False),
+        diverged=np.zeros(len(recording.time), bool),
     )
 
 
@@ -158,7 +152,7 @@ def without_goal(result: Result, rows: int) -> Result:
     """`result` with its goal NaN after the first `rows`, where it was not tracked."""
     target = np.array(result.flight.target, float)
     target[rows:] = np.nan
-    return dataclasses.replace(result, flight=dataclasses.replace(result.flight, target=target))
+    return dataclasses.replace(result, flight=result.flight._replace(target=target))
 
 
 def _cut(result: Result, rows: int) -> Result:
@@ -167,7 +161,7 @@ def _cut(result: Result, rows: int) -> Result:
     for name in ("position", "velocity", "euler", "cg_offset"):
         parts[name] = np.array(getattr(flight, name), float)
         parts[name][rows:] = np.nan
-    return dataclasses.replace(result, flight=dataclasses.replace(flight, **parts))
+    return dataclasses.replace(result, flight=flight._replace(**parts))
 
 
 if __name__ == "__main__":

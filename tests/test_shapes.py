@@ -95,7 +95,7 @@ FLIGHTS = """
 import dataclasses
 from mjxball import config
 from mjxball.baselines import make_baseline
-from batch import Batch
+from batch import fly_compiled
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
@@ -103,7 +103,7 @@ settings = config.preset("paper")
 disturbed = Disturbance(noise=1.0, delay=0.04, relay_rate=10.0, gust=0.1, estimator_drift=1.0, quantize=True)
 flown = [Scenario(seconds=0.1), Scenario(seconds=0.1, disturbance=disturbed, mass_changes=((0.05, 0.1),))]
 follower = make_baseline("copy", settings)
-Batch(settings, follower).fly(flown)
+fly_compiled(settings, follower, flown)
 for physics in ("newton-euler", "mujoco"):
     simulate_batch(settings, [(follower, flown)], physics)
 """

@@ -1,21 +1,27 @@
-"""When a flight of mjxball-bench is met, and what a track comes to."""
+"""When a flight succeeds beside references, and the summary of a track of mjxball-bench."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import binomtest
 
 from mjxball.evaluate.metrics import Metrics
 
-# A flight is met if it does not fail and has, of the best that a reference has there, at most
-PEAK = 0.003  # more peak [m], times the world's length
-LATER, LATER_SECONDS = 0.1, 0.1  # so much later settling, whichever is more: share, [s]
-OVERSHOOT = 0.01  # more overshoot
-CONFIDENCE = 0.95  # of the interval of what is met (Wilson 1927)
+
+class Bound(NamedTuple):
+    """By how much a number may exceed that of the best reference: by the larger of both."""
+
+    absolute: float = 0.0  # in the unit of the number; of a peak [m] times the length of the plant
+    relative: float = 0.0  # share of the reference's number
+
+
+# A flight of mjxball-bench succeeds if it does not fail and is within these: peak [m], settling time [s], overshoot.
+BOUNDS = {"peak": Bound(0.003), "settling": Bound(0.1, 0.1), "overshoot": Bound(0.01)}
+CONFIDENCE = 0.95  # of the interval of the share of successes (Wilson 1927)
 
 
 def numbers(metrics: Metrics) -> tuple[float, float, float]:
@@ -26,19 +32,25 @@ def numbers(metrics: Metrics) -> tuple[float, float, float]:
     return metrics.peak, settling, math.inf if metrics.overshoot is None else metrics.overshoot
 
 
-def later(settling: Any) -> Any:
-    """The latest settling time [s], or times, with which a flight is met where a reference has `settling`."""
-    return settling + np.maximum(LATER_SECONDS, LATER * settling)
+def limits(best: Mapping[str, Any], bounds: Mapping[str, Bound], length: Any = 1.0) -> dict[str, Any]:
+    """The largest numbers that succeed, for each name of `bounds`, where references have `best`; arrays or floats.
+
+    Infinite where no reference has a finite number. `length` of the plant, over that which the bounds are meant for.
+    """
+    most = {}
+    for name, bound in bounds.items():
+        absolute = bound.absolute * length if name == "peak" else bound.absolute
+        most[name] = best[name] + np.maximum(absolute, bound.relative * best[name] if bound.relative else 0.0)
+    return most
 
 
 def bar(best: np.ndarray, length: float = 1.0) -> np.ndarray:
-    """(flights, 3): the largest `numbers` with which flights are met where references have `best` (flights, 3)."""
-    peak, settling, overshoot = best.T
-    return np.stack([peak + PEAK * length, later(settling), overshoot + OVERSHOOT], axis=1)
+    """(flights, 3): the largest `numbers` with which flights succeed where references have `best` (flights, 3)."""
+    return np.stack([*limits(dict(zip(BOUNDS, best.T, strict=True)), BOUNDS, length).values()], axis=1)
 
 
 def are_met(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
-    """Whether each flight is met, of `bars` (flights, 3)."""
+    """Whether each flight succeeds, of `bars` (flights, 3)."""
     return [
         not metrics.failed and bool((np.array(numbers(metrics)) <= most).all())
         for metrics, most in zip(flown, bars, strict=True)

@@ -16,12 +16,11 @@ from mjxball.bench import VERSION
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
-from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
+from mjxball.evaluate.metrics import Metrics, fly_and_measure
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude, largest_margin
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rigs import draw_rigs, rig_config, unpadded
-from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import CgPath, Scenario
 
 ENGINE = "newton-euler"
@@ -57,11 +56,9 @@ class World:
     length: float = 1.0  # factor on criteria in metres
 
     def fly(self, followers: Sequence[Follower], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
-        """Metrics of every flight of every follower, by follower, simulated in float64."""
-        flown = simulate_batch(self.config, [(follower, scenarios) for follower in followers], ENGINE)
-        plant, count = self.config.plant, len(scenarios)
-        limit, most = self.config.scenario.termination_distance, rotor_limits(plant, [*scenarios] * len(followers))
-        found = measure_batch(flown, limit, most, plant.leader)
+        """Metrics of every flight of every follower, in float64."""
+        _, found = fly_and_measure(self.config, [(follower, scenarios) for follower in followers], ENGINE)
+        count = len(scenarios)
         return [found[first : first + count] for first in range(0, len(found), count)]
 
 

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.arrays import Array
-from mjxball.config import Plant
+from mjxball.config import Config, Plant
 from mjxball.rewards import paper_reward
-from mjxball.sim.rollout import Tick, Trajectory
+from mjxball.sim.rollout import Flights, simulate_batch
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 
 RMSE_UNTIL = 20.0  # [s]
 PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
@@ -60,9 +61,9 @@ class Metrics:
 class RunningMetrics(NamedTuple):
     """Sums and extremes of n flights so far, NumPy or JAX arrays (n,) unless said otherwise."""
 
-    steps: Array  # ()
-    time: Array  # () of the last step [s]
-    early: Array  # () steps within the first 20 s
+    steps: Array  # () or (n,)
+    time: Array  # () or (n,), of the last step [s]
+    early: Array  # () or (n,), steps within the first 20 s
     sums: Array  # (n, 9) over the steps of what `_taken` says
     excess: Array  # (n, 9) what rounding has added to them: it may always round the same way
     failed: Array
@@ -107,68 +108,72 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
 
 
 def update(
-    running: RunningMetrics, tick: Tick, termination_distance: float, rotor_force_max: Array | float, leader: int = 0
+    running: RunningMetrics,
+    row: Trajectory,
+    termination_distance: float,
+    rotor_force_max: Array | float,
+    leader: int = 0,
 ) -> RunningMetrics:
     """Take one control step of all flights into account; `leader` is the number of the drone that leads.
 
     `rotor_force_max` [N] is one number, or (N,) or (n, N), see `rotor_limits`.
     """
-    xp = tick.position.__array_namespace__()
-    error = tick.target - tick.position
+    xp = row.position.__array_namespace__()
+    error = row.target - row.position
     distance = _norm(error)
     # Where the goal has changed, settling and peaks start again.
-    new = xp.any(tick.target != running.target, axis=-1)
+    new = xp.any(row.target != running.target, axis=-1)
     initial = xp.where(new, distance, running.initial)
-    steady_from = xp.where(new, tick.time + WAYPOINT_SECONDS, running.steady_from)
+    steady_from = xp.where(new, row.time + WAYPOINT_SECONDS, running.steady_from)
     steady_from = xp.where(steady_from > STEADY_AFTER, steady_from, STEADY_AFTER)
     outside = xp.where(new[:, None], -xp.inf, running.outside)
     beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
     peaks = xp.where(new[:, None], xp.nan, running.peaks)
-    steady = tick.time >= steady_from - TINY
+    steady = row.time >= steady_from - TINY
     errors = xp.concat([xp.abs(error), xp.hypot(error[:, :1], error[:, 1:2])], axis=-1)
-    sums, excess = compensated_sum(running.sums, running.excess, _taken(running, tick, rotor_force_max, leader))
+    sums, excess = compensated_sum(running.sums, running.excess, _taken(running, row, rotor_force_max, leader))
     return RunningMetrics(
         steps=running.steps + 1,
-        time=running.time * 0 + tick.time,
-        early=running.early + xp.where(tick.time <= RMSE_UNTIL + TINY, 1.0, 0.0),
+        time=running.time * 0 + row.time,
+        early=running.early + xp.where(row.time <= RMSE_UNTIL + TINY, 1.0, 0.0),
         sums=sums,
         excess=excess,
-        failed=running.failed | tick.diverged | ~(distance <= termination_distance),
+        failed=running.failed | row.diverged | ~(distance <= termination_distance),
         initial=initial,
-        leg=xp.where(new, tick.time, running.leg),
+        leg=xp.where(new, row.time, running.leg),
         steady_from=steady_from,
         steady=xp.where(new, 0.0, running.steady) + xp.where(steady, 1.0, 0.0),
-        outside=xp.where(beyond, tick.time, outside),
+        outside=xp.where(beyond, row.time, outside),
         peaks=xp.where(steady[:, None], xp.fmax(peaks, errors), peaks),
-        furthest=xp.fmax(running.furthest, tick.position * xp.sign(tick.target)),
-        tilt=xp.fmax(running.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
+        furthest=xp.fmax(running.furthest, row.position * xp.sign(row.target)),
+        tilt=xp.fmax(running.tilt, xp.hypot(row.euler[:, 0], row.euler[:, 1])),
         hover=running.hover,
         hover_power=running.hover_power,
-        tilts=xp.reshape(tick.follower_command, (*running.hover.shape[:2], 3))[..., :2],
-        target=tick.target,
+        tilts=xp.reshape(row.follower_command, (*running.hover.shape[:2], 3))[..., :2],
+        target=row.target,
     )
 
 
-def _taken(running: RunningMetrics, tick: Tick, rotor_force_max: Array | float, leader: int) -> Array:
+def _taken(running: RunningMetrics, row: Trajectory, rotor_force_max: Array | float, leader: int) -> Array:
     """What one control step adds to `RunningMetrics.sums` (n, 9)."""
-    xp = tick.position.__array_namespace__()
-    rotors = _of_followers(tick.rotor_force, leader)
-    led, followed = tick.leader_command[:, None], xp.reshape(tick.follower_command, (*rotors.shape[:2], 3))
+    xp = row.position.__array_namespace__()
+    rotors = _of_followers(row.rotor_force, leader)
+    led, followed = row.leader_command[:, None], xp.reshape(row.follower_command, (*rotors.shape[:2], 3))
     tilts = followed[..., :2]
     most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
-    most = xp.broadcast_to(most, tick.rotor_force.shape[:-1])[..., None]
-    saturated = _of_followers(near_limit(SATURATED_WITHIN, tick.rotor_force, most), leader)
+    most = xp.broadcast_to(most, row.rotor_force.shape[:-1])[..., None]
+    saturated = _of_followers(near_limit(SATURATED_WITHIN, row.rotor_force, most), leader)
     change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
     apart = tilts - xp.mean(tilts, axis=-2, keepdims=True)
     taken = (
-        xp.where(tick.time <= RMSE_UNTIL + TINY, _norm(tick.target - tick.position) ** 2, 0.0),
+        xp.where(row.time <= RMSE_UNTIL + TINY, _norm(row.target - row.position) ** 2, 0.0),
         xp.mean((followed - led) ** 2, axis=(-2, -1)),
         xp.where(running.steps < PAPER_STEPS, xp.mean(paper_reward(led, followed), axis=-1), 0.0),
         xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
         xp.where(running.steps > 0, change, 0.0),
         xp.mean(saturated, axis=(-2, -1)),
-        xp.max(near_limit(AT_LIMIT_WITHIN, tick.rotor_force, most), axis=(-2, -1)),
-        power_of(tick.rotor_force),
+        xp.max(near_limit(AT_LIMIT_WITHIN, row.rotor_force, most), axis=(-2, -1)),
+        power_of(row.rotor_force),
         xp.mean(apart**2, axis=(-2, -1)),
     )
     return xp.stack(taken, axis=-1)
@@ -190,7 +195,7 @@ def results(running: RunningMetrics) -> list[Metrics]:
         goal = np.where(t.target == 0, np.nan, t.target)
         over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / np.abs(goal))
         settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
-        settled = np.where(t.outside >= t.time - NEVER_WITHIN - ROUNDING, np.nan, settled)
+        settled = np.where(t.outside >= (t.time - NEVER_WITHIN - ROUNDING)[..., None], np.nan, settled)
         columns = {
             "rmse": np.sqrt(square / t.early),
             "settling_time": settled[:, 0],
@@ -204,7 +209,7 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "settling_time_10": settled[:, 1],
             "paper_return": returned,
             "effort": np.sqrt(effort / t.steps),
-            "smoothness": np.sqrt(change / max(t.steps - 1, 1)),
+            "smoothness": np.sqrt(change / np.maximum(t.steps - 1, 1)),
             "saturation": saturated / t.steps,
             "rotors_at_limit": limited / t.steps,
             "rotor_power": power / t.steps / t.hover_power,
@@ -226,6 +231,13 @@ def rotor_limits(plant: Plant, scenarios: Sequence[Scenario]) -> np.ndarray:
     return found
 
 
+def fly_and_measure(config: Config, flights: Flights, physics: str = "mjx") -> tuple[Trajectory, list[Metrics]]:
+    """Every flight of `simulate_batch`, with its metrics."""
+    flown, scenarios = simulate_batch(config, flights, physics), [one for _, part in flights for one in part]
+    limit, most = config.scenario.termination_distance, rotor_limits(config.plant, scenarios)
+    return flown, measure_batch(flown, limit, most, config.plant.leader)
+
+
 def measure(
     flight: Trajectory, termination_distance: float = 2.5, rotor_force_max: Array | float = 5.5, leader: int = 0
 ) -> Metrics:
@@ -237,10 +249,10 @@ def measure_batch(
     flights: Trajectory, termination_distance: float, rotor_force_max: Array | float = 5.5, leader: int = 0
 ) -> list[Metrics]:
     """Metrics of every flight of a recorded batch."""
-    first = flights.tick(0)
+    first = flights.row(0)
     running = begin(first.position, first.target, first.rotor_force, leader)
     for number in range(len(flights.time)):
-        running = update(running, flights.tick(number), termination_distance, rotor_force_max, leader)
+        running = update(running, flights.row(number), termination_distance, rotor_force_max, leader)
     return results(running)
 
 

@@ -23,7 +23,7 @@ from mjxball.plotting import (
     save,
     style,
 )
-from mjxball.sim.rollout import Trajectory
+from mjxball.sim.trajectory import Trajectory
 
 PAPER_POINTS = 700  # points per curve in the paper's figures
 LEAST_SPAN = 0.01  # smallest range of an axis [m], [deg], [m/s2]

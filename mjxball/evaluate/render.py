@@ -23,7 +23,7 @@ from mjxball import config as configs
 from mjxball.config import Plant
 from mjxball.errors import InputError
 from mjxball.reading import parse_json
-from mjxball.sim.rollout import Trajectory
+from mjxball.sim.trajectory import Trajectory
 
 TIME_LIMIT = 240  # for a report's animation [s]
 TRAIL = 3.0  # length of the path that is drawn [s]

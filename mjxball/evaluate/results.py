@@ -15,9 +15,9 @@ import numpy as np
 from mjxball import terminal
 from mjxball.config import Config
 from mjxball.control.followers import Follower
-from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
-from mjxball.sim.rollout import Trajectory, simulate_batch
+from mjxball.evaluate.metrics import Metrics, fly_and_measure
 from mjxball.sim.scenario import Scenario, of_plant
+from mjxball.sim.trajectory import Trajectory
 
 RESULTS = "cells.json"  # in the output directory
 # The metrics in `--json`, a fixed format; a benchmark's scores have all of them.
@@ -63,10 +63,7 @@ def fly_scenarios(
 ) -> list[Result]:
     """Fly every follower through every scenario; results are ordered by scenario, then by follower."""
     scenarios = [of_plant(config, scenario) for scenario in scenarios]
-    flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
-    plant, limit = config.plant, config.scenario.termination_distance
-    most = rotor_limits(plant, [scenario for _ in followers for scenario in scenarios])
-    measured = measure_batch(flights, limit, most, plant.leader)
+    flights, measured = fly_and_measure(config, [(follower, scenarios) for follower in followers], physics)
     results = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
         index = j * len(scenarios) + i

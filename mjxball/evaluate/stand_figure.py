@@ -16,8 +16,9 @@ from mjxball.evaluate.metrics import STEADY_AFTER
 from mjxball.evaluate.plots import Figure, panels, thinned
 from mjxball.plotting import INK, follower_styles, legend_above, line, logarithmic, rendered
 from mjxball.policy import Policy
-from mjxball.sim.rollout import Trajectory, check_rate, simulate_batch
+from mjxball.sim.rollout import check_rate, simulate_batch
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 
 SETTINGS = {"paper": "the paper's gains", "better": "better settings"}
 # The leader's gains of free flight with a quarter of the height integral, and thrust by the motors' curve.

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import astuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mjxball import pictures
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
-from mjxball.control.followers import Baseline, Follower, PrivilegedInfo, checked_command
+from mjxball.control.followers import Baseline, Follower, Law, PrivilegedInfo, checked_command
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
@@ -27,111 +24,90 @@ from mjxball.physics.step import (
     with_external_force,
 )
 from mjxball.plant import plant_parameters
-from mjxball.sim.closed_loop import ClosedLoop
-from mjxball.sim.disturbances import followers_axis, record, sensors_of
+from mjxball.sim.closed_loop import ClosedLoop, LoopState
+from mjxball.sim.disturbances import Sample, SensorModel, followers_axis, record, sensors_of
 from mjxball.sim.scenario import CgPath, Scenario, check_scenario, of_plant
+from mjxball.sim.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float, Int
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import Coordinates
 
-# Observations (n, 18), of several followers (n, F, 18), and who tells what is known -> commands (n, 3), or (n, F, 3).
-Act = Callable[[np.ndarray, Callable[[], PrivilegedInfo]], np.ndarray]
-
 Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
 
 
-class Tick(NamedTuple):
-    """One control step of n flights, as far as its metrics go: rows of a `Trajectory`."""
+class Carry(NamedTuple):
+    """What n flights carry from one control step to the next."""
 
-    time: float  # [s]
-    position: Float[np.ndarray, "n 3"]  # of O in the world [m]
-    target: Float[np.ndarray, "n 3"]  # goal of O [m]
-    euler: Float[np.ndarray, "n 3"]  # roll, pitch, yaw [rad]
-    rotor_force: Float[np.ndarray, "n drones 4"]  # [N]
-    leader_command: Float[np.ndarray, "n 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
-    follower_command: Float[np.ndarray, "n ... 3"]  # likewise, (n, F, 3) of several followers
-    diverged: Bool[np.ndarray, " n"]
+    loop: LoopState
+    observation: Float[Array, "n ... 18"]
+    follower: Any  # state of the controller
 
 
-@dataclass(frozen=True)
-class Trajectory:
-    """A flight, or a batch of flights with the batch axis second. NumPy float64, one row per control step.
+class Inputs(NamedTuple):
+    """What n flights are given in a control step, or with a leading axis in each of T."""
 
-    Where there are several followers, `follower_command` and `observation` have their axis, in the order of
-    `plant.followers`, before the last one; `cg_offset` has a last axis of 2 where the load moves in the plane.
-    T = round(seconds / control period) + 1 rows; row 0 is the start. A flight that diverges (|e_o| or a body
-    rate beyond any bound, or a value that is not finite) is frozen there and marked in `diverged`.
+    time: Float[Array, ""]  # at the beginning [s]
+    goal: Float[Array, "n 3"]  # of O at the beginning [m]
+    next_goal: Float[Array, "n 3"]  # of O at the end [m]
+    force: Float[Array, "n 3"] | None  # external force on O meanwhile [N]; None: none
+    sample: Sample  # disturbances of the measurement at the end
+
+    def at(self, number: int) -> Inputs:
+        """Step `number`."""
+        force = None if self.force is None else self.force[number]
+        return Inputs(self.time[number], self.goal[number], self.next_goal[number], force, self.sample.at(number))
+
+
+def control_step(
+    loop: ClosedLoop,
+    controller: Law,
+    privileged: Callable[[PlantState, Load], Any],
+    load: Load,
+    carry: Carry,
+    inputs: Inputs,
+    on_pid: Array | float = 1.0,
+) -> tuple[Carry, Trajectory]:
+    """One control period of n flights, on NumPy or JAX arrays: (what goes on, the row of its beginning).
+
+    The followers' `controller` sees `carry.observation` and, from `privileged`, what it may know of plant and `load`;
+    `on_pid` as of `ClosedLoop.step`.
     """
+    state, seen, plant = carry.loop, carry.observation, carry.loop.plant
+    memory, answer = controller.step(carry.follower, seen, privileged(plant, load))
+    acting, goals = load._replace(external_force=inputs.force), (inputs.goal, inputs.next_goal)
+    moved, observation, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, on_pid)
+    row = Trajectory.of(plant, inputs.time, inputs.goal, commands, diverged=state.diverged, observation=seen)
+    return Carry(moved, observation, memory), row
 
-    time: Float[np.ndarray, " T"]  # [s]
-    position: Float[np.ndarray, "T ... 3"]  # of O in the world [m]
-    velocity: Float[np.ndarray, "T ... 3"]  # of O in the world [m/s]
-    euler: Float[np.ndarray, "T ... 3"]  # roll, pitch, yaw [rad]
-    rates: Float[np.ndarray, "T ... 3"]  # body rates [rad/s]
-    quaternion: Float[np.ndarray, "T ... 4"]  # body -> world (w, x, y, z)
-    rotor_force: Float[np.ndarray, "T ... drones 4"]  # [N]
-    leader_command: Float[np.ndarray, "T ... 3"]  # roll, pitch [rad], vertical acceleration [m/s2], in body axes
-    follower_command: Float[np.ndarray, "T ... 3"]  # likewise
-    observation: Float[np.ndarray, "T ... 18"]  # what the followers saw, in their mount frames
-    cg_offset: Float[np.ndarray, "T ..."]  # along the load's directions from O [m]
-    object_mass: Float[np.ndarray, "T ..."]  # [kg]
-    contact_force: Float[np.ndarray, "T ... drones 3"]  # of every drone on the carrier, body axes [N]
-    contact_torque: Float[np.ndarray, "T ... drones 3"]  # likewise, about each drone's centre [N m]
-    goal: Float[np.ndarray, "... 3"]  # of O, the last one of a sequence of waypoints [m]
-    target: Float[np.ndarray, "T ... 3"]  # goal of O at every step [m]
-    diverged: Bool[np.ndarray, "..."]
 
-    @property
-    def _summary(self) -> str:
-        several = f", {self.position.shape[1]} flights" if self.position.ndim > 2 else ""
-        diverged = int(np.sum(self.diverged))
-        lost = f", {diverged} diverged" if diverged else ""
-        return f"{self.time[-1]:g} s, {len(self.time)} steps{several}{lost}"
+class ScenarioArrays(NamedTuple):
+    """Scenarios of one length as arrays of n flights: what `control_step` needs to fly them."""
 
-    def __repr__(self) -> str:
-        return f"<Trajectory {self._summary}>"
+    load: Load
+    start: PlantState
+    inputs: Inputs  # of T control steps
+    first: Sample  # disturbances of the first measurement
+    sensors: SensorModel
+    delays: Int[np.ndarray, "n ..."]  # of the measurements, in control steps
 
-    def _repr_html_(self) -> str:
-        """For notebooks: the error over time, of several flights its length."""
-        if self.position.ndim == 2:
-            lines = [pictures.Curve(f"error along {'xyz'[axis]}", self.time, self.error[:, axis]) for axis in range(3)]
-        else:
-            far = np.linalg.norm(self.error, axis=-1)
-            lines = [pictures.Curve(f"flight {number}", self.time, far[:, number]) for number in range(far.shape[1])][
-                :4
-            ]
-        return pictures.card("flight", {"of": self._summary}, pictures.curves(lines, "time [s]", "error [m]"))
 
-    @property
-    def error(self) -> Float[np.ndarray, "T ... 3"]:
-        """e_o = target - position [m]."""
-        return self.target - self.position
-
-    def tick(self, number: int) -> Tick:
-        """Control step `number` of a batch."""
-        rows = {name: getattr(self, name)[number] for name in Tick._fields if name != "diverged"}
-        return Tick(**rows, diverged=self.diverged)
-
-    def copied(self) -> Trajectory:
-        """The same with memory of its own: `world` shares that of its whole batch."""
-        return self._each(lambda value, _: np.array(value))
-
-    def batched(self) -> Trajectory:
-        """A single flight as a batch of one."""
-        return self._each(np.expand_dims)
-
-    def world(self, index: int) -> Trajectory:
-        """Flight `index` of a batch."""
-        return self._each(lambda value, axis: value[:, index] if axis else value[index])
-
-    def _each(self, change: Callable[[np.ndarray, int], np.ndarray]) -> Trajectory:
-        """The same with `change(array, number of its batch axis)` of all arrays but the time."""
-        parts = {item.name: getattr(self, item.name) for item in dataclasses.fields(self) if item.name != "time"}
-        axes = {"goal": 0, "diverged": 0}
-        return Trajectory(self.time, **{name: change(value, axes.get(name, 1)) for name, value in parts.items()})
+def scenario_arrays(config: Config, scenarios: Sequence[Scenario]) -> ScenarioArrays:
+    """`scenarios`, checked, as arrays; InputError unless all last equally long."""
+    scenarios = [check_scenario(config, scenario) for scenario in scenarios]
+    if len({scenario.seconds for scenario in scenarios}) != 1:
+        raise InputError("scenarios of one batch must last equally long")
+    period, followers = config.timing.control_period, followers_axis(config)
+    steps = round(scenarios[0].seconds / period) + 1
+    target, disturbances = targets(config, scenarios, steps), [scenario.disturbance for scenario in scenarios]
+    samples = record(disturbances, steps + 1, period, followers)
+    later, force = samples.at(slice(1, None))._replace(force=None), samples.at(slice(steps)).force
+    # The time is exact, so that a mass change falls on the same row for every engine.
+    inputs = Inputs(np.arange(steps) * period, target[:-1], target[1:], force, later)
+    load, start = load_of(config, scenarios), start_of(config, scenarios)
+    return ScenarioArrays(load, start, inputs, samples.at(0), *sensors_of(disturbances, period, followers))
 
 
 def simulate(
@@ -160,98 +136,64 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
 
     All scenarios must last equally long. Each follower is called once per control step for its own part.
     """
-    scenarios, act = _together(config, flights)
-    cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
-    count = round(scenarios[0].seconds / period)
-    load, target = load_of(config, scenarios), targets(config, scenarios, count + 1)
-    disturbances, followers = [scenario.disturbance for scenario in scenarios], followers_axis(config)
-    samples, on_pid = record(disturbances, count + 2, period, followers), on_pid_of(flights)
-    sensors, delays = sensors_of(disturbances, period, followers)
-    loop = ClosedLoop(config, make_stepper(config, physics), sensors)
-    state, observation = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
-    plants, rows = [], []
-    for number in range(count + 1):
-        plant, goals, diverged = state.plant, (target[number], target[number + 1]), state.diverged
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-        answer = act(observation, partial(privileged, plant, load))
-        acting, seen = load._replace(external_force=samples.at(number).force), observation
-        state, observation, commands = loop.step(state, seen, answer, acting, goals, samples.at(number + 1), on_pid)
-        plants.append(plant)
-        rows.append((euler, *commands, seen, cg_offset(plant, load)))
-    flown = plants[0].each(lambda *leaves: np.stack(leaves), *plants[1:])
-    pushed = load._replace(external_force=samples.at(slice(count + 1)).force)
-    stacked = [np.stack(part) for part in zip(*rows, strict=True)]
-    return _trajectory(config, flown, stacked, target[:-1], diverged, pushed, physics)
-
-
-def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
-    """All scenarios in order, checked, and the followers' laws, each for its own part of the batch."""
     validate(config)
-    scenarios = [check_scenario(config, scenario) for _, part in flights for scenario in part]
-    if len({scenario.seconds for scenario in scenarios}) != 1:
-        raise InputError("scenarios of one batch must last equally long")
-    ends = np.cumsum([len(part) for _, part in flights])
-    parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
-    followers = [follower for follower, _ in flights]
-    for follower in followers:
-        if hasattr(follower, "step") and not hasattr(follower, "reset"):
-            name = type(follower).__name__
-            raise InputError(f"{name} is a law; mjxball.control.followers.Baseline({name}(config), config) flies it")
-        follower.reset()
+    controller = _Together(flights)
+    flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
+    on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
+    privileged = make_privileged_info(config) if not on_pid.all() else lambda *_: None
+    loop = ClosedLoop(config, make_stepper(config, physics), flown.sensors)
+    state, observation = loop.start(flown.start, inputs.goal[0], flown.first, flown.delays)
+    carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
+    for number in range(len(inputs.time)):
+        plants.append(carry.loop.plant)
+        carry, row = control_step(loop, controller, privileged, load, carry, inputs.at(number), on_pid)
+        rows.append(row)
+    plant = plants[0].each(lambda *leaves: np.stack(leaves), *plants[1:])
+    flight = Trajectory(*(None if part[0] is None else np.stack(part) for part in zip(*rows, strict=True)))
+    cg_offset = make_cg_offset(config)(plant, load)
+    plant = plant._replace(time=np.broadcast_to(inputs.time[:, None], plant.time.shape))
+    wrenches = flown_contact_wrenches(config, plant, load._replace(external_force=inputs.force), physics)
+    return flight._replace(
+        cg_offset=cg_offset,
+        object_mass=object_mass(plant.time, load),
+        contact_force=wrenches[0],
+        contact_torque=wrenches[1],
+    )
 
-    told = any(isinstance(follower, Baseline) for follower in followers)
 
-    def act(observation: np.ndarray, privileged: Callable[[], PrivilegedInfo]) -> np.ndarray:
-        commands, known = [], privileged() if told else ()
-        for follower, part in zip(followers, parts, strict=True):
+class _Together:
+    """The followers of `flights` as one controller of the whole batch, each for its own scenarios."""
+
+    name = "together"
+    needs_privileged = True
+
+    def __init__(self, flights: Flights):
+        ends = np.cumsum([len(part) for _, part in flights])
+        parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
+        self._followers = [(follower, part) for (follower, _), part in zip(flights, parts, strict=True)]
+        for follower, _ in self._followers:
+            if hasattr(follower, "step") and not hasattr(follower, "reset"):
+                name = type(follower).__name__
+                raise InputError(
+                    f"{name} is a law; mjxball.control.followers.Baseline({name}(config), config) flies it"
+                )
+            follower.reset()
+        # 1 for every flight of a policy, whose base is the leader's whole PID; 0 for one of a baseline.
+        self.on_pid = np.array([1.0 - isinstance(follower, Baseline) for follower, part in flights for _ in part])
+
+    def start(self, observation: np.ndarray) -> tuple[()]:
+        """Nothing: the followers remember themselves."""
+        return ()
+
+    def step(self, state: Any, observation: np.ndarray, privileged: PrivilegedInfo) -> tuple[Any, np.ndarray]:
+        """See `Law.step`."""
+        commands = []
+        for follower, part in self._followers:
             if isinstance(follower, Baseline):
-                follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in known))
+                follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in privileged))
             seen = observation[part]
             commands.append(checked_command(getattr(follower, "name", type(follower).__name__), follower(seen), seen))
-        return np.concatenate(commands)
-
-    return scenarios, act
-
-
-def on_pid_of(flights: Flights) -> Float[np.ndarray, " n"]:
-    """1.0 for every flight whose follower's base is the leader's whole PID law: a policy, not a baseline."""
-    return np.array([0.0 if isinstance(follower, Baseline) else 1.0 for follower, part in flights for _ in part])
-
-
-def _trajectory(
-    config: Config,
-    flown: PlantState,
-    rows: Sequence[np.ndarray],
-    target: np.ndarray,
-    diverged: np.ndarray,
-    load: Load,
-    physics: str,
-) -> Trajectory:
-    """Of recorded states (T, n, ...) with what goes with each: attitude, commands, observation and CG offset."""
-    # The time is exact, so that a mass change falls on the same row for every engine.
-    time = np.arange(len(target)) * config.timing.control_period
-    flown = flown._replace(time=np.broadcast_to(time[:, None], flown.time.shape))
-    euler, leader_command, follower_command, observation, cg_offset = rows
-    force, torque = flown_contact_wrenches(config, flown, load, physics)
-    return Trajectory(
-        time=time,
-        position=flown.position,
-        velocity=flown.velocity,
-        euler=euler,
-        rates=flown.rates,
-        quaternion=flown.quaternion,
-        rotor_force=flown.rotor_force,
-        leader_command=leader_command,
-        follower_command=follower_command,
-        observation=observation,
-        cg_offset=cg_offset,
-        object_mass=object_mass(flown.time, load),
-        contact_force=force,
-        contact_torque=torque,
-        goal=target[-1],
-        target=target,
-        diverged=diverged,
-    )
+        return state, np.concatenate(commands)
 
 
 def make_privileged_info(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:

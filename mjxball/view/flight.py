@@ -28,7 +28,7 @@ from mjxball.reading import check_times, parse_json
 from mjxball.terminal import warn
 
 if TYPE_CHECKING:
-    from mjxball.sim.rollout import Trajectory
+    from mjxball.sim.trajectory import Trajectory
 
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20

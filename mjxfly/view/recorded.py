@@ -31,8 +31,7 @@ def read_log(path: Path) -> Flight:
         raise InputError(f"{path} says no goal that could be shown; mjxfly.log draws it")
     for remark in recording.remarks:
         warn(remark)
-    known = dataclasses.replace(
-        trajectory_of(recording),
+    known = trajectory_of(recording)._replace(
         leader_command=np.nan_to_num(recording.leader),
         follower_command=np.nan_to_num(recording.follower),
         cg_offset=np.zeros(rows := len(recording.time)),

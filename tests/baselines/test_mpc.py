@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import minimize
 from tables import rows
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball import config as configs
 from mjxball.baselines import make_baseline, make_law
 from mjxball.baselines.motion import (
@@ -204,7 +204,7 @@ def test_a_load_near_the_rotors_limits_does_not_throw_it_over(heavy) -> None:
 def test_a_jax_program_calls_it_back(heavy) -> None:
     """float32 and a tolerance of 1e-3 in the programs: a millimetre."""
     follower = make_baseline("mpc", PAPER)
-    batched = Batch(PAPER, follower).fly(heavy)
+    batched = fly_compiled(PAPER, follower, heavy)
     recorded = simulate_batch(PAPER, [(follower, heavy)], "newton-euler")
     for mine, other in zip(batched, measure_batch(recorded, 2.5, PAPER.plant.rotor_force_max, 0), strict=True):
         assert mine.rmse == pytest.approx(other.rmse, abs=1e-3)

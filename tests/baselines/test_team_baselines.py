@@ -10,7 +10,7 @@ import pytest
 from plants import team
 from tables import rows
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball.baselines import make_baseline, make_law
 from mjxball.baselines.assembly_model import assembly_model
 from mjxball.config import Attitude, Config, apply_overrides, preset, replace, with_plant
@@ -192,7 +192,7 @@ def test_a_batch_of_a_team_equals_its_recorded_flights(name: str) -> None:
     """On JAX in float32, a loss among them: 1e-3 m, or half a per cent of a fall."""
     common = {"mass": 0.6, "path": ELLIPSE, "seconds": 21.0}
     scenarios = [Scenario(**common), Scenario(**common, lost=((2, 19.0),), disturbance=Disturbance(noise=0.3))]
-    batched = Batch(STRONG, make_baseline(name, STRONG)).fly(scenarios)
+    batched = fly_compiled(STRONG, make_baseline(name, STRONG), scenarios)
     for mine, other in zip(batched, flown(STRONG, [name], scenarios)[name], strict=True):
         assert mine.rmse == pytest.approx(other.rmse, abs=1e-3)
         assert mine.x_peak == pytest.approx(other.x_peak, rel=5e-3, abs=1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tables import weekly
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball.baselines import LAWS, make_baseline
 from mjxball.config import preset
 from mjxball.errors import InputError
@@ -39,7 +39,7 @@ SCENARIOS = [
 )
 def test_batch_equals_recorded_flights(name: str) -> None:
     follower = make_baseline(name, CONFIG) if name in LAWS else Policy.load(shipped_policy(name))
-    batched = Batch(CONFIG, follower).fly(SCENARIOS)
+    batched = fly_compiled(CONFIG, follower, SCENARIOS)
     recorded = [cell.metrics for cell in fly_scenarios(CONFIG, [follower], SCENARIOS, "newton-euler")]
     for mine, other in zip(batched, recorded, strict=True):
         for field in dataclasses.fields(mine):
@@ -59,11 +59,12 @@ def test_what_a_batch_cannot_fly_is_refused() -> None:
     class Mine:
         name = "mine"
 
+    copying = make_baseline("copy", CONFIG)
     with pytest.raises(InputError, match="mujoco"):
-        Batch(CONFIG, make_baseline("copy", CONFIG), "mujoco")
+        fly_compiled(CONFIG, copying, SCENARIOS, "mujoco")
     with pytest.raises(InputError, match="no baseline and no policy"):
-        Batch(CONFIG, Mine())
+        fly_compiled(CONFIG, Mine(), SCENARIOS)
     with pytest.raises(InputError, match="equally long"):
-        Batch(CONFIG, make_baseline("copy", CONFIG)).fly([Scenario(seconds=1), Scenario(seconds=2)])
+        fly_compiled(CONFIG, copying, [Scenario(seconds=1), Scenario(seconds=2)])
     with pytest.raises(InputError, match="finite"):
-        Batch(CONFIG, make_baseline("copy", CONFIG)).fly([Scenario(omega=np.inf)])
+        fly_compiled(CONFIG, copying, [Scenario(omega=np.inf)])

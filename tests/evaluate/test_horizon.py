@@ -14,7 +14,7 @@ import pytest
 from command_line import REPOSITORY, call
 from tables import rows, weekly
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball.baselines import make_baseline
 from mjxball.cli import plant_setup
 from mjxball.commands import evaluate
@@ -94,8 +94,8 @@ def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
     flown = Policy.load(path).card["flown"]
     plants = [setup for _, setup in horizon.own_plants(path) if setup.plant.count in flown["drones"]]
     setup = max(plants, key=lambda one: one.plant.count)
-    batch = Batch(setup, load_policy(path, setup))
-    early, late = (batch.fly(horizon.own_scenarios(setup, seconds)) for seconds in (horizon.MINUTE, horizon.TEN))
+    policy, lengths = load_policy(path, setup), (horizon.MINUTE, horizon.TEN)
+    early, late = (fly_compiled(setup, policy, horizon.own_scenarios(setup, seconds)) for seconds in lengths)
     good = late if flown["seconds"] >= horizon.TEN else early
     for first, last, held in zip(early, late, good, strict=True):
         assert not last.failed
@@ -104,7 +104,7 @@ def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
 
 def test_a_flight_that_grows_or_saturates_is_not_steady(horizon: ModuleType) -> None:
     config = preset("paper")
-    found = Batch(config, make_baseline("lqg", config)).fly([Scenario(seconds=22.0)])[0]
+    found = fly_compiled(config, make_baseline("lqg", config), [Scenario(seconds=22.0)])[0]
     assert horizon.is_steady(found, found)
     for change in ({"z_peak": 0.02}, {"rotors_at_limit": 0.3}, {"failed": True}, {"x_peak": None}):
         assert not horizon.is_steady(dataclasses.replace(found, **change), found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -12,8 +11,8 @@ import pytest
 
 from mjxball.config import preset
 from mjxball.evaluate.metrics import Metrics, begin, measure, measure_batch, results, rotor_limits, update
-from mjxball.sim.rollout import Tick, Trajectory
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.trajectory import Trajectory
 
 TIME = np.arange(1501) * 0.02  # 30 s
 GOAL = np.array([1.0, -2.0, 0.0])
@@ -38,9 +37,8 @@ def flight(position: np.ndarray, **parts: Any) -> Trajectory:
         "object_mass": zero[0],
         "contact_force": np.zeros((n, 2, 3)),
         "contact_torque": np.zeros((n, 2, 3)),
-        "goal": GOAL,
         "target": np.tile(GOAL, (n, 1)),
-        "diverged": np.bool_(False),
+        "diverged": np.zeros(n, bool),
     }
     return Trajectory(**{**common, **parts})
 
@@ -56,10 +54,11 @@ def of(trajectory: Trajectory) -> Metrics:
 
 def test_means_of_ten_minutes_of_equal_steps_in_float32() -> None:
     """Rounding always the same way adds up: the mean power was 0.04 % off, that of a day 2.4 %."""
-    steps, force, zero = round(600 / 0.02), jnp.full((1, 2, 4), 0.6419), jnp.zeros((1, 3))
-    tick = Tick(jnp.zeros(()), zero, zero, zero, force, zero, jnp.full((1, 3), 0.0123), jnp.zeros(1, bool))
-    running = begin(zero, zero, jnp.full((1, 2, 4), 0.63))
-    later = jax.jit(lambda given: jax.lax.fori_loop(0, steps, lambda _, one: update(one, tick, 2.5, 5.5), given))
+    steps, still = round(600 / 0.02), {"target": np.zeros((1, 3)), "follower_command": np.full((1, 3), 0.0123)}
+    one = flight(np.zeros((1, 3)), rotor_force=np.full((1, 2, 4), 0.6419), **still)
+    row = jax.tree.map(jnp.asarray, one.batched().row(0))  # in float32
+    running = begin(row.position, row.target, jnp.full((1, 2, 4), 0.63))
+    later = jax.jit(lambda given: jax.lax.fori_loop(0, steps, lambda _, one: update(one, row, 2.5, 5.5), given))
     found = results(later(running))[0]
     # 1e-6: eight roundings of 6e-8 each in one step.
     assert found.rotor_power == pytest.approx((0.6419 / 0.63) ** 1.5, rel=1e-6)
@@ -164,7 +163,7 @@ def test_failures() -> None:
     far = approach()
     far[100, 2] = 2.6
     assert of(flight(far)).failed
-    assert of(flight(approach(), diverged=np.bool_(True))).failed
+    assert of(flight(approach(), diverged=TIME > 29.0)).failed
     lost = approach()
     lost[50:] = np.nan
     found = of(flight(lost))
@@ -176,7 +175,7 @@ def test_waypoints_start_settling_and_peaks_anew() -> None:
     target[500:] = (0.0, 0.0, 0.0)  # at 10 s
     position = approach(5.0)
     position[500:] = GOAL * np.exp(-(TIME[500:] - TIME[500]))[:, None]
-    found = of(flight(position, target=target, goal=np.zeros(3)))
+    found = of(flight(position, target=target))
     assert found.settling_time == pytest.approx(np.floor(np.log(50) / 0.02) * 0.02)
     assert found.x_peak == pytest.approx(np.exp(-10.0))  # from 20 s, 10 s after the waypoint
     assert found.overshoot is None
@@ -184,9 +183,5 @@ def test_waypoints_start_settling_and_peaks_anew() -> None:
 
 def test_a_batch_is_measured_as_its_flights() -> None:
     flights = [flight(approach(rate)) for rate in (0.1, 1.0, 3.0)]
-    parts = {}
-    for item in dataclasses.fields(Trajectory):
-        values = [getattr(one, item.name) for one in flights]
-        axis = 0 if item.name in ("goal", "diverged") else 1
-        parts[item.name] = values[0] if item.name == "time" else np.stack(values, axis=axis)
-    assert measure_batch(Trajectory(**parts), 2.5) == [of(one) for one in flights]
+    batch = Trajectory(TIME, *(np.stack(part, axis=1) for part in zip(*(one[1:] for one in flights), strict=True)))
+    assert measure_batch(batch, 2.5) == [of(one) for one in flights]

@@ -12,7 +12,7 @@ import pytest
 from plants import team
 from tables import rows
 
-from batch import Batch
+from batch import fly_compiled
 from mjxball.baselines import make_baseline
 from mjxball.config import Attitude, Config, Drone, Plant, preset, replace, with_plant
 from mjxball.control.attitude import rotor_commands
@@ -226,7 +226,7 @@ def test_a_pair_holds_what_its_roll_commands_trim_and_loses_what_they_do_not() -
     assert most == pytest.approx(0.0939, abs=1e-4)
     rest = Scenario(omega=0.0, phase=math.pi / 2, path=CgPath(direction=math.pi / 2), seconds=22.0)
     flights = [dataclasses.replace(rest, amplitude=share * most) for share in (0.95, 1.2)]
-    held, lost = Batch(wide, make_baseline("oracle", wide)).fly(flights)
+    held, lost = fly_compiled(wide, make_baseline("oracle", wide), flights)
     assert (held.failed, held.y_peak) == (False, pytest.approx(0.0, abs=1e-3))
     assert lost.y_peak is not None
     assert lost.y_peak > 0.5
