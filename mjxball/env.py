@@ -40,10 +40,7 @@ STEADY_IN_TRAINING_AFTER = 8.0
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """State with the fields of Brax's `State`, without the second that an import of Brax takes.
-
-    Arrays may have any leading batch shape.
-    """
+    """The fields of Brax's `State`, whose import takes a second. Arrays may have any leading batch shape."""
 
     pipeline_state: Any  # `PipelineState`
     obs: Any  # (n,) the networks' input
@@ -343,11 +340,10 @@ class TransportEnv:
         return self._privileged(self._fresh_world(rng)[0])
 
     def _privileged(self, world: PipelineState) -> Float[Array, "... privileged"]:
-        """Inputs of the critics alone, in SI units.
+        """Inputs of the critics alone: CG offset, first moment, object mass, its difference from the assumed mass.
 
-        CG offset, first moment, object mass, and its difference from the mass that the leader assumes. Depending on the
-        configuration also the undisturbed observation, force and levels of disturbances, actuator errors, integrals of
-        the controllers, rate of the ball, battery, and the size of the team.
+        Depending on the configuration then the undisturbed observation, force and levels of disturbances, actuator
+        errors, controllers' integrals, rate of the ball, battery, and the size of the team.
         """
         loop, load = self._loop_of(world.rig), world.load
         offset, mass = self._cg(world.plant, load), object_mass(world.plant.time, load)
@@ -391,7 +387,7 @@ class TransportEnv:
     def _transition(
         self, before: PipelineState, after: PipelineState, commands: Commands, terminated: Bool[Array, ""]
     ) -> rewards.Transition:
-        """Inputs of the reward for the step from `before` to `after`."""
+        """Inputs of the reward of the step from `before` to `after`."""
         plant = after.plant
         remembers = bool(self.config.follower.observation_averages)
         return rewards.Transition(

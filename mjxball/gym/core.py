@@ -62,7 +62,7 @@ def check_process() -> None:
 
 
 class Program(NamedTuple):
-    """Functions of one world or of N at once, each compiled at its first call. A chain is a key, split at each reset."""
+    """Functions of one world or of N at once, each compiled at its first call. A chain is a key split at each reset."""
 
     env: TransportEnv
     chain: Any  # seed, as of `seed_number` -> chain

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjxball.policy.file import PolicyFile
 
-LARGEST = 127
+MAX_INT8 = 127
 
 
 class Rows(NamedTuple):
@@ -22,7 +22,7 @@ class Rows(NamedTuple):
 def rows_of(weight: np.ndarray) -> Rows:
     """The layer `weight` (inputs, outputs) quantised such that the largest weight of each output is 127 steps."""
     rows = np.asarray(weight, np.float32).T
-    step = np.abs(rows).max(axis=1) / np.float32(LARGEST)
+    step = np.abs(rows).max(axis=1) / np.float32(MAX_INT8)
     rounded = np.rint(rows / np.where(step > 0, step, 1)[:, None])
     return Rows(rounded.astype(np.int8), step.astype(np.float32))
 
