@@ -105,7 +105,6 @@ def to_mjcf(plant: Plant) -> str:
 
 
 def _add_root_joints(body: mujoco.MjsBody, stand: str) -> None:
-    """The root's joints on `stand`, see `build_spec`."""
     if stand == "free":
         body.add_freejoint(name="free")
         return

@@ -122,6 +122,5 @@ def _thinned(curve: Curve) -> list[tuple[float, float]]:
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
-    """(minimum, maximum) of `values`, widened to 1 if they are equal."""
     low, high = min(values), max(values)
     return (low, high) if high > low else (low - 0.5, high + 0.5)

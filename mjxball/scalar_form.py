@@ -94,7 +94,6 @@ def _elements(array: Any, batched: int) -> list[Any]:
 
 
 def _shaped(elements: Sequence[Any], shape: tuple[int, ...]) -> Parts:
-    """`elements` in row-major order as an object array."""
     parts = np.empty(shape, object)
     for index, element in zip(np.ndindex(shape), elements, strict=True):
         parts[index] = element
@@ -102,7 +101,6 @@ def _shaped(elements: Sequence[Any], shape: tuple[int, ...]) -> Parts:
 
 
 def _evaluate(jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
-    """The outputs of `jaxpr`, equation by equation."""
     values: dict[Any, Value] = {}
 
     def read(variable: Any) -> Value:
@@ -313,7 +311,6 @@ def _compute(equation: Any, operands: list[Any]) -> Any:
 
 
 def _reduce(combine: Callable[[Any, Any], Any], parts: Parts, axes: Sequence[int]) -> Parts:
-    """`parts` combined in order over `axes`."""
     kept = [axis for axis in range(parts.ndim) if axis not in axes]
     shape = [parts.shape[axis] for axis in kept]
     rows = parts.transpose([*kept, *axes]).reshape([*shape, -1])

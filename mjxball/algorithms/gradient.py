@@ -321,7 +321,6 @@ def _clip_backwards(leaves: list[Array], decay: Array, longest: Array) -> list[A
 
 
 def _clip(factors: tuple[Array, Array], slopes: list[Array]) -> tuple[Any, ...]:
-    """Gradients of `_clip_backwards`: those of `leaves`, clipped and decayed, and zeros."""
     decay, longest = factors
     slopes = [jnp.where(jnp.isfinite(one), one, 0.0) for one in slopes]
     length = jnp.sqrt(sum((one.reshape(len(one), -1) ** 2).sum(axis=1) for one in slopes))

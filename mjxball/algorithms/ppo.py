@@ -11,13 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import (
-    Environments,
-    Phase,
-    PolicyNetwork,
-    Schedule,
-    Transition,
-)
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, Transition
 from mjxball.algorithms.networks import normaliser
 from mjxball.algorithms.recurrent import RecurrentPolicy, answer
 from mjxball.config import Config, Ppo

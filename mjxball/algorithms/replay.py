@@ -109,7 +109,6 @@ def _starts(replay: Replay, draws: UInt[Array, " batch"], num_envs: int, steps: 
 
 
 def _unpack(rows: Float[Array, "batch width"], observation_size: int, action_size: int) -> Transitions:
-    """The columns of `rows` in the order in which `insert` writes them."""
     n, a = observation_size, action_size
     return Transitions(
         observation=rows[:, :n],

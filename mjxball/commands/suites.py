@@ -11,15 +11,7 @@ from mjxball.baselines import SUITE_BASELINES
 from mjxball.bench.report import write_report
 from mjxball.bench.scores import run_benchmark, text_table
 from mjxball.bench.suites import BY_NAME, list_suites
-from mjxball.commands.followers import (
-    add_flight,
-    add_followers,
-    add_policies,
-    clock,
-    load,
-    named,
-    refuse_same_names,
-)
+from mjxball.commands.followers import add_flight, add_followers, add_policies, clock, load, named, refuse_same_names
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import group_by_plant

@@ -35,10 +35,7 @@ from mjxball.policy.file import policy_path
 from mjxball.terminal import say, warn
 from mjxball.train import processes, shares
 from mjxball.train.curves import draw_training
-from mjxball.train.run_directory import (
-    CHECKPOINTS,
-    POLICY,
-)
+from mjxball.train.run_directory import CHECKPOINTS, POLICY
 from mjxball.xla import check_address_space, enable_compilation_cache
 
 # Settings that `--help` lists; `--help all` lists every one.
@@ -131,7 +128,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _train(options: argparse.Namespace, command: str) -> int:
-    """`main` for parsed `options`."""
     rendezvous, started = _rendezvous(options), time.monotonic()
     check_packages()
     if options.gather is not None:

@@ -19,13 +19,7 @@ from mjxball.algorithms.base import Phase, PolicyNetwork, Shards
 from mjxball.config import Config
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
-from mjxball.train.compilation import (
-    Carrying,
-    TracedProgram,
-    compiler_options,
-    jax_setting,
-    partitioned_by_gspmd,
-)
+from mjxball.train.compilation import Carrying, TracedProgram, compiler_options, jax_setting, partitioned_by_gspmd
 from mjxball.train.extensions import DEFAULTS, Extensions
 from mjxball.train.program import Program, Statistics, TrainState, report, train, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
@@ -366,7 +360,6 @@ class Population:
         return jax.tree.map(placed, specs, template, is_leaf=_is_spec)
 
     def _member_program(self, values: Mapping[str, Array]) -> Program:
-        """The program of a member with these swept values."""
         if not values:
             return self.program
         return Program(self.config, self._physics, values, self._shards, self._extensions)

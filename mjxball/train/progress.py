@@ -181,7 +181,6 @@ def _point(row: Mapping[str, str], began: float) -> Point:
 
 
 def _rows_until(path: Path, names: Sequence[str], steps: int) -> list[dict[str, str]]:
-    """Rows of `metrics.csv` up to `steps` with these columns; none without the file."""
     if not steps or not path.exists():
         return []
     return [row for row in read_metrics(path) if set(row) == set(names) and int(row["steps"]) <= steps]

@@ -41,7 +41,6 @@ def required(config: Config, algorithm: str, members: int) -> Required:
 
 
 def _weights(inputs: int, layers: Sequence[int], outputs: int) -> int:
-    """Number of weights and biases of a multi-layer perceptron."""
     return sum(a * b + b for a, b in itertools.pairwise((inputs, *layers, outputs)))
 
 
@@ -137,7 +136,6 @@ def _left_of_group() -> float:
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines of a text file; none if it cannot be read."""
     try:
         return path.read_text(encoding="ascii").split("\n")[:-1]
     except (OSError, UnicodeDecodeError):

@@ -85,7 +85,6 @@ def write_rows(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any
 
 
 def _refusal(path: Path, called: str, why: object) -> InputError:
-    """The error for a file that cannot be read; `called` as in `read_json`."""
     words = " ".join(str(why).split())[:200]
     return InputError(f"{called}{' ' if called else ''}{path} cannot be read: {words}")
 

@@ -12,15 +12,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, load_file, save_file
 from mjxball.train.curves import LOG, POLICIES, best_member, read_members
-from mjxball.train.run_directory import (
-    METRICS,
-    MOST_MEMBERS,
-    POLICY,
-    members_of,
-    read_config,
-    read_metrics,
-    write_rows,
-)
+from mjxball.train.run_directory import METRICS, MOST_MEMBERS, POLICY, members_of, read_config, read_metrics, write_rows
 
 SAME = ("physics", "seeds", "source_hash", "versions", "extensions", "extension_hash")
 

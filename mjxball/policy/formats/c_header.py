@@ -15,13 +15,7 @@ from mjxball import __version__
 from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
 from mjxball.control.followers import LARGEST
 from mjxball.control.geometry import GEOMETRY_SIZE
-from mjxball.control.observation import (
-    ACTION_SIZE,
-    ERROR,
-    ERROR_RATE,
-    OBSERVATION,
-    OBSERVATION_SIZE,
-)
+from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
@@ -161,7 +155,6 @@ def layers_of(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def _float_arrays(policy: PolicyFile) -> list[str]:
-    """C definitions of the normalisation and of all layers."""
     arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
     for number, (weight, bias) in enumerate(zip(*layers_of(policy), strict=True)):
         arrays += [_array(f"weight_{number}", _side_by_side(weight))]
@@ -182,7 +175,6 @@ def _literal(value: float | np.floating) -> str:
 
 
 def _array(label: str, values: Iterable[Any]) -> str:
-    """C definition of a constant array of floats."""
     literals = [_literal(value) for value in np.asarray(values, np.float32).ravel()]
     rows = [", ".join(literals[k : k + 8]) for k in range(0, len(literals), 8)]
     body = ",\n    ".join(rows)
@@ -195,7 +187,6 @@ def _plain(text: Any) -> str:
 
 
 def _table() -> str:
-    """Lines of the header's comment on the observation: slot, name, unit."""
     return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
 
 
