@@ -114,8 +114,8 @@ class Population:
         On one device a function can be called while others are still being compiled.
         """
         options = compiler_options(self.program.algorithm, self.members)
-        # XLA releases the GIL: the largest program is traced first, the others while it compiles. With several
-        # processes on one GPU, two compilations at once crash.
+        # XLA releases the GIL: the largest program is traced first, the others while it compiles. In a process that
+        # shares GPUs with others, two compilations at once crash.
         pool = ThreadPoolExecutor(4 if jax.process_count() == 1 else 1)
         with (
             partitioned_by_gspmd(self.mesh),
