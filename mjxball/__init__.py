@@ -4,10 +4,11 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
-# XLA writes two lines of 2 kB to stderr for each CPU program that it loads from its cache. What goes wrong is raised.
+# Silence XLA, which writes two lines of 2 kB to stderr for each CPU program that it loads from its cache. Errors are
+# raised as exceptions anyway.
 if "jax" not in sys.modules:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-elif os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "1":  # which JAX itself says, to a library that has read it by now
+elif os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "1":  # JAX's own setting, which jaxlib has already read
     _set_level = getattr(sys.modules.get("jaxlib.utils"), "absl_set_min_log_level", None)
     if _set_level:
         _set_level(3)

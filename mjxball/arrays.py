@@ -1,4 +1,4 @@
-"""Arrays of any library that follows the Python array API standard: NumPy's, JAX's, traced ones."""
+"""Helpers for arrays of any library that follows the Python array API standard: NumPy, JAX, traced arrays."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 from mjxball.errors import FOREIGN, InputError, said
 
-# No type checker has a name for what they share. Shapes stand in annotations, `Float[Array, "... 3"]`, or docstrings.
+# Type checkers have no common type for them. Shapes are given in annotations, `Float[Array, "... 3"]`, or docstrings.
 Array: TypeAlias = Any
 
 
 def real_numbers(given: Any, what: str) -> np.ndarray:
-    """`given` from outside as an array of real numbers; InputError, which begins with `what`, for anything else.
+    """`given`, a caller's argument, as an array of real numbers. Raises InputError, which begins with `what`.
 
-    NumPy makes numbers of much: it takes what a mask hides, drops imaginary parts, reads words, truths and objects.
+    Stricter than NumPy, which ignores masks, drops imaginary parts, and converts strings, booleans and objects.
     """
     if _has_mask(given):
         raise InputError(f"{what} must be real numbers, and some are masked: fill them in, or leave it out")
     try:
         array = np.asarray(given)
-    except FOREIGN as error:  # ragged lists, and whatever somebody else's arrays raise
+    except FOREIGN as error:  # ragged lists, and any error of the caller's array type
         raise InputError(f"{what} must be real numbers, and is no array of them: {said(error)}") from None
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be real numbers, not {array.dtype}")
@@ -43,9 +43,9 @@ def components(vector: Array) -> Sequence[Array]:
 
 
 def joined(components: Sequence[Array], axis: int = -1) -> Array:
-    """Arrays of one shape as one, along a new last `axis` (-1) or last but one (-2).
+    """`stack` of arrays of one shape along a new last `axis` (-1) or last but one (-2).
 
-    What `stack` does, of which NumPy's takes twice as long on small arrays. Floats become a vector.
+    NumPy's `stack` takes twice as long on small arrays. Floats become one vector.
     """
     first = components[0]
     if isinstance(first, float):
@@ -57,14 +57,14 @@ def joined(components: Sequence[Array], axis: int = -1) -> Array:
 
 
 def clipped(value: Array, low: Any, high: Any) -> Array:
-    """`value` (...) within `low` and `high`: `clip`, of which NumPy's takes twice as long on small arrays."""
+    """`clip` of `value` (...) to `low` and `high`. NumPy's takes twice as long on small arrays."""
     if isinstance(value, np.ndarray | np.generic):
         return np.minimum(np.maximum(value, low), high)
     return value.__array_namespace__().clip(value, low, high)
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """`a @ b` in the precision of its arrays. JAX's own `@` rounds float32 on GPUs, to 10 bits (TF32) since Ampere."""
+    """`a @ b` in the precision of its arrays. On GPUs JAX's `@` rounds float32 to TF32 (10 bits)."""
     other = b if isinstance(a, np.ndarray) else a
     xp = other.__array_namespace__() if hasattr(other, "__array_namespace__") else np
     return xp.matmul(a, b, precision="highest") if xp.__name__ == "jax.numpy" else a @ b

@@ -1,4 +1,4 @@
-"""Drones, carrier, object and ball as one MuJoCo model, built with MjSpec from the typed config.
+"""MuJoCo model of drones, carrier, object and ball, built with MjSpec from a `Plant`.
 
 `python -m mjxball.assembly OUT.xml [--plant NAME|FILE]` writes a plant as MJCF, for any MuJoCo viewer.
 """
@@ -22,29 +22,29 @@ ASSEMBLY = "assembly"
 LEADER = "leader"
 FOLLOWER = "follower"
 BALL = "ball"
-BALL_JOINT = "cg"  # the first of the ball's slides
+BALL_JOINT = "cg"  # the ball's first slide joint
 BALL_JOINTS = (BALL_JOINT, "cg_across")
-RIM_PARTS = 24  # of a drawn plate's rim
+RIM_PARTS = 24  # number of capsules that draw a plate's rim
 COLOURS = {LEADER: (0.85, 0.25, 0.2, 1.0), FOLLOWER: (0.2, 0.4, 0.85, 1.0)}
 
 
 def drone_names(plant: Plant) -> list[str]:
-    """Names of the drones' bodies in their order: leader, follower; of several followers follower1, follower2, ..."""
+    """Names of the drones' bodies in the plant's order: leader and follower, or follower1, follower2, ... of a team."""
     followers = plant.count - 1
     numbered = iter([FOLLOWER] if followers == 1 else [f"{FOLLOWER}{number + 1}" for number in range(followers)])
     return [LEADER if number == plant.leader else next(numbered) for number in range(plant.count)]
 
 
 def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
-    """Return the model's MjSpec: carrier and shell, welded drones, and the moving mass on one slide joint or two.
+    """MjSpec of the assembly: carrier and shell, welded drones, and the moving mass on one or two slide joints.
 
-    The drones' centres sit at their mounts, turned by their yaw. In the reference plant the shell is massless and the
-    ball carries the object's whole mass with the box's inertia. The root is free, or on a stand: a
-    hinge along x (`pivot`), or a vertical slide and that hinge (`heave`). Four `motor` actuators for each drone, in
-    the drones' order, take rotor forces in newtons; their gear holds the yaw moment.
-    `timestep` [s] matters only to viewers and to MuJoCo's own integrator.
+    The drones' centres are at their mounts, turned by their yaw. In the reference plant the shell is massless, and the
+    ball has the object's whole mass with the box's inertia. The root is free, or on a stand: a hinge along x (`pivot`),
+    or a vertical slide and that hinge (`heave`). Each drone has four `motor` actuators, in the drones' order, whose
+    controls are rotor forces [N]; their gear contains the yaw moment. `timestep` [s] affects viewers and MuJoCo's own
+    integrator only.
     """
-    numbers = plant_parameters(plant, Attitude())
+    parameters = plant_parameters(plant, Attitude())
     fixed, moving = (1 - plant.moving_fraction) * plant.object_mass, plant.moving_fraction * plant.object_mass
     spec = mujoco.MjSpec()
     spec.modelname = "mjxball"
@@ -53,7 +53,7 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     _add_scenery(spec)
-    shell_inertia = numbers.carrier_inertia + plant.object_mass * numbers.shell_inertia_per_mass
+    shell_inertia = parameters.carrier_inertia + plant.object_mass * parameters.shell_inertia_per_mass
     body = spec.worldbody.add_body(
         name=ASSEMBLY,
         mass=fixed + plant.carrier_mass,
@@ -73,7 +73,7 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
         mass=moving,
         explicitinertial=True,
         ipos=[0, 0, 0],
-        inertia=(plant.object_mass * numbers.ball_inertia_per_mass).tolist(),
+        inertia=(plant.object_mass * parameters.ball_inertia_per_mass).tolist(),
     )
     for joint, direction in zip(BALL_JOINTS, plant.directions, strict=False):
         axis = np.eye(3)[direction].tolist()
@@ -83,9 +83,9 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
 
 
 def build_model(plant: Plant, timestep: float = 0.002, fuse: bool = False) -> mujoco.MjModel:
-    """Compile `build_spec`; `fuse` merges the welded drones into the assembly's body and drops what is only seen.
+    """Compile `build_spec`. `fuse` merges the welded drones into the assembly's body and drops visual elements.
 
-    The fused model has the same dynamics and is what MJX steps; contact wrenches need the unfused one.
+    The fused model, which MJX steps, has the same dynamics. Contact wrenches need the unfused one.
     """
     spec = build_spec(plant, timestep)
     if fuse:
@@ -98,7 +98,7 @@ def build_model(plant: Plant, timestep: float = 0.002, fuse: bool = False) -> mu
 
 
 def to_mjcf(plant: Plant) -> str:
-    """The model as MJCF text, which any MuJoCo viewer opens."""
+    """The model as MJCF text for any MuJoCo viewer."""
     spec = build_spec(plant)
     spec.compile()
     return spec.to_xml()
@@ -142,7 +142,7 @@ def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Any
 
 
 def _add_shell(body: mujoco.MjsBody, plant: Plant) -> None:
-    """The object; where the load moves in the plane a plate, thin enough to show the drones on it, and its rim."""
+    """Visual of the object. A load that moves in the plane has a plate, drawn thin so that drones show, and its rim."""
     half, colour = np.array(plant.object_size) / 2, (0.75, 0.65, 0.45, 0.35)
     if len(plant.directions) == 2:
         half[2] *= 0.2
@@ -159,27 +159,27 @@ def _add_shell(body: mujoco.MjsBody, plant: Plant) -> None:
 
 
 def _add_spokes(body: mujoco.MjsBody, plant: Plant) -> None:
-    """Rods from O to every drone, which are only drawn."""
+    """Visual rods from O to every drone."""
     for number, drone in enumerate(plant.drones):
         rod = _add_visual(body, f"spoke{number}", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.008], (0.75, 0.65, 0.45, 0.8))
         rod.fromto[:] = [0, 0, 0, *drone.mount]
 
 
 def _add_drone(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, number: int, plant: Plant) -> None:
-    """Drone `number` of `plant`, whose body is called `name`."""
-    own = plant.drones[number]
+    """Body, visuals, sites and actuators of drone `number` of `plant`; the body is called `name`."""
+    mounted = plant.drones[number]
     arm, force, yaw_per_thrust = (
         plant.of_drones(field)[number] for field in ("arm", "rotor_force_max", "yaw_per_thrust")
     )
     colour = COLOURS[LEADER if number == plant.leader else FOLLOWER]
     drone = parent.add_body(
         name=name,
-        pos=own.mount,
-        quat=[np.cos(own.yaw / 2), 0, 0, np.sin(own.yaw / 2)],
-        mass=own.mass,
+        pos=mounted.mount,
+        quat=[np.cos(mounted.yaw / 2), 0, 0, np.sin(mounted.yaw / 2)],
+        mass=mounted.mass,
         explicitinertial=True,
         ipos=[0, 0, 0],
-        inertia=list(own.inertia),
+        inertia=list(mounted.inertia),
     )
     _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], colour)
     places, spins = rotors.PLACES[plant.layout], rotors.SPIN[plant.layout]

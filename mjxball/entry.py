@@ -1,4 +1,4 @@
-"""Entry points of installed commands, and of train.py and eval.py; imports nothing heavy by itself."""
+"""Entry points of installed commands, train.py and eval.py. Heavy modules are imported when a command runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def train() -> int:
     """Run `train.py`; return its exit code."""
     collect_seldom()
     switch_often()
-    return run_module("mjxball.commands.train")  # until training starts there is nothing to save
+    return run_module("mjxball.commands.train")  # which handles Ctrl-C itself once training has started
 
 
 def evaluate() -> int:
@@ -32,9 +32,9 @@ def export() -> int:
 
 
 def run_module(module: str) -> int:
-    """`main` of `module`, which Ctrl-C ends at once: there is nothing to save.
+    """Run `main` of `module` and return its exit code. Ctrl-C exits at once, without a traceback.
 
-    Returns its exit code; `FAULT` after an error of the program's own: 1, which Python would say, is a result.
+    After an unexpected exception the code is `FAULT`, because Python's 1 is the code of some results.
     """
     quit_on_interrupt()
     try:

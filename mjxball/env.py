@@ -32,40 +32,40 @@ from mjxball.sim.rigs import RigTable, whole
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
-# [s] of an episode, after which its error counts as steady state in training's metrics. Episodes last 20 s, after which
-# alone the evaluation counts; the goal is reached after 4 s.
+# Time in an episode after which its error counts as steady state in training's metrics [s]. The goal is reached after
+# 4 s; training's episodes last 20 s, and the evaluation's steady state begins only after that.
 STEADY_IN_TRAINING_AFTER = 8.0
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The fields of Brax's `State`. Brax itself takes a second to import, most of it for meshes."""
+    """The fields of Brax's `State`, whose import takes a second. Arrays may have any leading batch shape."""
 
     pipeline_state: Any  # `PipelineState`
-    obs: Any  # (n,) the networks' input; like all that follow with any leading batch shape, or without arrays as a tree
+    obs: Any  # (n,) the networks' input
     reward: Any  # ()
-    done: Any  # () 1 at an end
+    done: Any  # () 1 at the end of an episode
     metrics: dict[str, Any]
     info: dict[str, Any]
 
     def replace(self, **fields: Any) -> State:
-        """The same with other `fields`."""
+        """A copy with these `fields` replaced."""
         return dataclasses.replace(self, **fields)
 
 
 class PipelineState(NamedTuple):
-    """Everything that one world carries from step to step."""
+    """State of one world between control steps."""
 
     loop: LoopState  # plant, leader's integral, sensors
     load: Load
     goal: Float[Array, "3"]  # of O [m]
-    disturbances: Any  # `sim.disturbances.RandomState`, () if nothing is disturbed
-    history: Any  # (m,) what the follower remembers; () if none: XLA's partitioner cannot bear arrays of no elements
+    disturbances: Any  # `sim.disturbances.RandomState`, () without disturbances
+    history: Any  # (m,) the follower's memory, () if m is 0: XLA's partitioner fails on empty arrays
     action: Float[Array, "... 3"]  # last network actions in [-1, 1]
-    command: Float[Array, "... 3"]  # the followers' last, roll, pitch [rad], vertical acceleration [m/s2]
+    command: Float[Array, "... 3"]  # last followers' commands: roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
-    rig: Any = ()  # its own `plant.PlantParameters`; () if all worlds have the plant's
+    rig: Any = ()  # `plant.PlantParameters` of this world; () if all worlds have the plant's
 
     @property
     def plant(self) -> PlantState:
@@ -74,21 +74,22 @@ class PipelineState(NamedTuple):
 
 
 class TransportEnv:
-    """A team with one object whose CG moves: the followers act, the leader flies its PID. Brax's `Env` interface.
+    """A team that carries one object whose CG moves. The policy flies the followers, a PID controller the leader.
 
-    Of a pair observations are (n,), actions (3,) and the reward (). Of F > 1 followers they are (F, n), (F, 3) and
-    (F,), each in its mount frame; worlds of smaller teams are padded to the plant's drones (`scenario.team_sizes`).
+    Implements Brax's `Env`. For a pair, observations are (n,), actions (3,) and the reward (). For F > 1 followers they
+    are (F, n), (F, 3) and (F,), each in its mount frame. Worlds of smaller teams are padded to the plant's number of
+    drones (`scenario.team_sizes`).
 
-    `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action (3,) and clips it to
-    [-1, 1]. An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
-    `timing.episode_steps`: `done` is 1 in both cases, `info["truncation"]` only in the second. Inside Brax's
-    EpisodeWrapper the wrapper keeps the time. A non-finite action counts as divergence.
+    `reset` samples goal, start, CG motion and object mass. `step` clips the action to [-1, 1]. An episode terminates at
+    |e_o| > d_term or when the world diverges, and is truncated at `timing.episode_steps`: `done` is 1 in both cases,
+    `info["truncation"]` only in the second. Brax's EpisodeWrapper, if present, truncates instead. An action that is not
+    finite counts as divergence.
     """
 
     def __init__(self, config: Config, physics: str = "mjx"):
         if physics not in TRAINING_ENGINES:
             raise ValueError(f"physics must be one of {TRAINING_ENGINES}, not {physics!r}")
-        if "brax.envs.base" in sys.modules:  # Brax's trainers ask whether it is an `Env` of Brax's
+        if "brax.envs.base" in sys.modules:  # Brax's trainers require an instance of its `Env`
             sys.modules["brax.envs.base"].Env.register(type(self))
         self.config = config
         self._backend = physics
@@ -98,21 +99,21 @@ class TransportEnv:
         self._loop = None if self._resets.rigs else self._make_loop()
         self._ball_limit = ball_limit(config.plant)
         self._law = law = follower_law(config)
-        # Calls of their own, which `scalar_form` leaves as they are if their arrays are large. A law has no
-        # hash, as `jax.jit` wants; `partial` has.
+        # Jitted separately: `scalar_form` keeps such calls whole if their arrays are large. `jax.jit` needs a hashable
+        # function, which `partial` makes of a method of the unhashable controller.
         parts = self._input, self._answer, law.next if law.size else lambda *_: ()
-        self._law_seen, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
+        self._network_input, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
         self._cg = make_cg_offset(config)
         commanded = layout.commanded(config.follower.load_axis_only, config.plant.cg_axis)
         self._commanded = np.append(commanded, np.ones(law.units))
-        self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
+        self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # index of the tilt (roll, pitch) free of CG torque
         self._in_plane = len(config.plant.directions) == 2
         self._privileged_size = 0
         if config.follower.privileged_critic:
             self._privileged_size = jax.eval_shape(self._first_privileged, jax.random.key(0)).shape[-1]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled by its arguments: what it traces and compiles is made again where it arrives."""
+        """Pickle the constructor's arguments alone; traced and compiled functions are rebuilt."""
         return type(self), (self.config, self._backend)
 
     @property
@@ -122,32 +123,32 @@ class TransportEnv:
 
     @property
     def policy_input_size(self) -> int:
-        """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
+        """Length of the policy's part of the observation; the rest is privileged information of the critics."""
         return self._law.input_size + self._law.units
 
     @property
     def input_mask(self) -> list[float]:
-        """1 for each number of the observation that the policy uses, else 0."""
+        """1 for each entry of the observation that the policy uses, else 0."""
         return [*self._law.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
 
     @property
     def critic_mask(self) -> list[float]:
-        """1 for each number of the observation that the critics use, else 0."""
+        """1 for each entry of the observation that the critics use, else 0."""
         return [*self._law.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
 
     @property
     def team_sizes(self) -> tuple[int, ...] | None:
-        """Numbers of drones of worlds 0, 1, ..., again and again; None for a pair, which has no followers' axis."""
+        """Number of drones in worlds 0, 1, ..., repeated cyclically; None for a pair, which has no followers' axis."""
         return (self.config.scenario.team_sizes or (self.config.plant.count,)) if self._followers else None
 
     @property
     def action_size(self) -> int:
-        """Roll, pitch, vertical acceleration, and behind them the next state of a recurrent network."""
+        """Length of an action: roll, pitch, vertical acceleration, then the next state of a recurrent network."""
         return layout.ACTION_SIZE + self._law.units
 
     @property
     def recurrent_slots(self) -> slice:
-        """Where the observation holds the state of a recurrent network; empty without one."""
+        """Entries of the observation that hold the state of a recurrent network; empty without one."""
         return slice(self.policy_input_size - self._law.units, self.policy_input_size)
 
     @property
@@ -171,7 +172,7 @@ class TransportEnv:
         number: Int[Array, ""] | None = None,
         rig: RigTable | None = None,
     ) -> State:
-        """A fresh world at rest or nearly so; its `number` and `rig` as in `ResetDistribution.draw`."""
+        """A sampled initial state, at rest or nearly so. `number` and `rig` as in `ResetDistribution.draw`."""
         world, observation = self._fresh_world(rng, number, rig)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
@@ -180,11 +181,11 @@ class TransportEnv:
         return State(world, self.seen(world, observation), reward, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Float[Array, "... actions"], physics: ControlStep | None = None) -> State:
-        """Apply the network's `action` for one control period, with `physics` in place of the engine.
+        """Apply the network's `action` for one control period. `physics`, if given, replaces the engine.
 
-        What lies outside [-1, 1] is clipped: followers, history and reward know no more. What a recurrent network
-        remembers is part of the state and of the observation: it is then a function without memory, whose answer
-        (..., 3 + H) ends with its next state. Raises InputError, as JAX traces it, for an action of another shape.
+        The action is clipped to [-1, 1] before the followers, the history and the reward use it. The state (H,) of a
+        recurrent network is part of the observation, and its next state the end of `action` (..., 3 + H). InputError,
+        while JAX traces, for an action of another shape.
         """
         world: PipelineState = state.pipeline_state
         shape = (*self._followers, self.action_size)
@@ -196,14 +197,14 @@ class TransportEnv:
         return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, physics)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
-        """`step` of a follower that is no network: `follower_command` is flown as it is."""
+        """`step` with the command of a follower that is no network, which is applied unchanged."""
         world = state.pipeline_state
         action = jnp.zeros((*follower_command.shape[:-1], self.action_size))
         memory = self._remembered(world.history, self._observed(state), action)
         return self._step(state, follower_command, memory, action, world.loop.diverged, 0.0)
 
     def commands(self, state: State, action: Float[Array, "... 3"]) -> tuple[Float[Array, "drones 3"], Load]:
-        """What the physics is given for one control period at the network's `action`; see `step`."""
+        """(commands of all drones, load) that `step` passes to the physics at the network's `action`."""
         given: list[Any] = []
 
         def physics(plant: PlantState, commands: Float[Array, "drones 3"], load: Load) -> PlantState:
@@ -226,7 +227,7 @@ class TransportEnv:
         on_pid: float,
         physics: ControlStep | None = None,
     ) -> State:
-        """The next state at the followers' `command`, who then have that `memory`; `on_pid`: see `ClosedLoop.step`."""
+        """The next state after the followers' `command`, with their new `memory`. `on_pid`: see `ClosedLoop.step`."""
         world: PipelineState = state.pipeline_state
         observation = self._observed(state)
         load = world.load
@@ -234,8 +235,8 @@ class TransportEnv:
             load = load._replace(external_force=world.disturbances.force)
         disturbances, sample = self._disturbances.step(world.disturbances)
         before, goals = world.loop._replace(diverged=diverged), (world.goal, world.goal)
-        own = self._loop_of(world.rig)
-        loop, after, commands = own.step(before, observation, command, load, goals, sample, on_pid, physics)
+        closed_loop = self._loop_of(world.rig)
+        loop, after, commands = closed_loop.step(before, observation, command, load, goals, sample, on_pid, physics)
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
@@ -246,7 +247,7 @@ class TransportEnv:
         )
         distance = jnp.linalg.norm(world.goal - loop.plant.position)
         terminated = jnp.logical_or(loop.diverged, distance > self.config.scenario.termination_distance)
-        # Brax's EpisodeWrapper keeps the time limit itself, and takes an end that it did not set for a termination.
+        # Brax's EpisodeWrapper applies the time limit itself, and would take ours for a termination.
         wrapped = "steps" in state.info
         truncated = jnp.logical_and(moved.steps >= self.config.timing.episode_steps, ~terminated) & (not wrapped)
         steady = (loop.plant.time > STEADY_IN_TRAINING_AFTER).astype(jnp.float32)
@@ -269,11 +270,11 @@ class TransportEnv:
         )
 
     def _make_loop(self, rig: PlantParameters | None = None) -> ClosedLoop:
-        physics = _made_when_called(functools.partial(make_physics, self.config, self._backend, rig))
+        physics = _lazy_control_step(functools.partial(make_physics, self.config, self._backend, rig))
         return ClosedLoop(self.config, physics, self._disturbances.sensors, rig)
 
     def _loop_of(self, rig: Any) -> ClosedLoop:
-        """The closed loop of a world with that `rig`."""
+        """The closed loop of a world with this `rig` (`PipelineState.rig`)."""
         return self._loop or self._make_loop(whole(rig, self.config.plant.gravity) if self.config.rigs.number else rig)
 
     def _fresh_world(
@@ -282,14 +283,14 @@ class TransportEnv:
         number: Int[Array, ""] | None = None,
         chosen: RigTable | None = None,
     ) -> tuple[PipelineState, Float[Array, "... 18"]]:
-        """(world, observation at its start)."""
+        """(world, its first observation)."""
         load, plant, goal, rig = self._resets.draw(rng, number, chosen)
-        numbers = () if rig is None else rig.numbers if rig.drawn is None else rig.drawn.numbers
+        parameters = () if rig is None else rig.numbers if rig.drawn is None else rig.drawn.numbers
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
-        begins = self._resets.has_battery and self.config.follower.residual_on_pid
-        integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if begins else None
-        loop, observation = self._loop_of(numbers).start(plant, goal, sample, delay, integral)
+        has_integrals = self._resets.has_battery and self.config.follower.residual_on_pid
+        integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if has_integrals else None
+        loop, observation = self._loop_of(parameters).start(plant, goal, sample, delay, integral)
         world = PipelineState(
             loop=loop,
             load=load,
@@ -299,39 +300,39 @@ class TransportEnv:
             action=jnp.zeros((*self._followers, 3)),
             command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
-            rig=numbers,
+            rig=parameters,
         )
         return world, observation
 
     def _geometry(self, rig: Rig | None) -> Any:
-        """Where the drones of a world are mounted, as its followers are told it; None if they are not."""
+        """Mount geometry of a world as given to its followers; None unless they take it."""
         if not self._law.geometry:
             return None
         plant = self.config.plant
         if rig is not None and rig.drawn is not None:
             return team_geometry(plant, rig.drawn.numbers.mounts, rig.drawn.size)
-        numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
-        mounts, masses = jnp.asarray(numbers.mounts, jnp.float32), jnp.asarray(numbers.drone_mass)
+        parameters = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
+        mounts, masses = jnp.asarray(parameters.mounts, jnp.float32), jnp.asarray(parameters.drone_mass)
         return team_geometry(plant, mounts, (masses > 0).sum().astype(jnp.float32))
 
     def seen(self, world: PipelineState, observation: Float[Array, "... 18"]) -> Float[Array, "... input"]:
-        """The networks' input: what followers see and remember, and behind it what only critics are given."""
-        shown = self._law_seen(observation, world.history) if self._law.size else observation
+        """The networks' input: the policy's input, then the critics' privileged information."""
+        network_input = self._network_input(observation, world.history) if self._law.size else observation
         if self.config.follower.privileged_critic:
-            shown = jnp.concatenate([shown, self._privileged(world)], axis=-1)
-        return shown
+            network_input = jnp.concatenate([network_input, self._privileged(world)], axis=-1)
+        return network_input
 
     def _input(self, observation: Float[Array, "... 18"], memory: Float[Array, "... m"]) -> Array:
-        """Input of the network."""
-        if self._law.geometry:  # nothing is learnt from what never changes: no derivatives need be carried through it
-            changes, told = memory[..., :-GEOMETRY_SIZE], memory[..., -GEOMETRY_SIZE:]
-            memory = jnp.concatenate([changes, jax.lax.stop_gradient(told)], axis=-1)
+        """Input of the policy network."""
+        if self._law.geometry:  # the geometry is constant, so no derivatives need be carried through it
+            history, geometry = memory[..., :-GEOMETRY_SIZE], memory[..., -GEOMETRY_SIZE:]
+            memory = jnp.concatenate([history, jax.lax.stop_gradient(geometry)], axis=-1)
         return self._law.network_input(observation, memory)
 
     def _answer(
         self, action: Float[Array, "... actions"], observation: Float[Array, "... 18"], memory: Any
     ) -> tuple[Float[Array, "... 3"], Any]:
-        """(command, memory of the next step) of the network's `action`."""
+        """(command, memory at the next step) for the network's `action`."""
         law = self._law
         return law.command(action, observation), law.next(memory, observation, action) if law.size else ()
 
@@ -339,14 +340,18 @@ class TransportEnv:
         return self._privileged(self._fresh_world(rng)[0])
 
     def _privileged(self, world: PipelineState) -> Float[Array, "... privileged"]:
-        """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""
+        """Inputs of the critics alone: CG offset, first moment, object mass, its difference from the assumed mass.
+
+        Depending on the configuration then the undisturbed observation, force and levels of disturbances, actuator
+        errors, controllers' integrals, rate of the ball, battery, and the size of the team.
+        """
         loop, load = self._loop_of(world.rig), world.load
         offset, mass = self._cg(world.plant, load), object_mass(world.plant.time, load)
         if self._in_plane:
             offset = loop.seen_by_followers(offset)
-        place = jnp.atleast_1d(offset)
+        offset = jnp.atleast_1d(offset)
         masses = jnp.stack([mass, mass - load.believed_mass])
-        parts: list[Any] = [place, mass * place, masses]
+        parts: list[Any] = [offset, mass * offset, masses]
         if self._disturbances.present:
             truth, disturbed = loop.observe(world.plant, world.goal), world.disturbances
             levels = jnp.stack([disturbed.noise, disturbed.delay.astype(jnp.float32)])
@@ -355,7 +360,7 @@ class TransportEnv:
         if self._resets.varies:
             lag: Array = load.rotor_lag_scale
             thrust: Array = load.thrust_scale
-            parts += [lag[None], self._own_and_leaders(thrust), load.added_inertia]
+            parts += [lag[None], self._leaders_and_own(thrust), load.added_inertia]
         if world.plant.loops is not None:
             integrals = crazyflie.unpack(world.plant.loops).rate_integral
             parts += [(integrals / jnp.asarray(crazyflie.RATE_LIMITS)).ravel()]
@@ -372,8 +377,8 @@ class TransportEnv:
             parts += [(world.rig.drone_mass > 0).sum()[None] / self.config.plant.count]
         return jnp.concatenate([jnp.broadcast_to(part, (*self._followers, part.shape[-1])) for part in parts], axis=-1)
 
-    def _own_and_leaders(self, each: Float[Array, " drones"]) -> Float[Array, "... 2"]:
-        """Of a number of every drone the leader's and the follower's own."""
+    def _leaders_and_own(self, each: Float[Array, " drones"]) -> Float[Array, "... 2"]:
+        """(leader's, follower's own) entries, one pair per follower, of a value for each drone."""
         if not self._followers:
             return each
         own = each[np.array(self.config.plant.followers)]
@@ -382,6 +387,7 @@ class TransportEnv:
     def _transition(
         self, before: PipelineState, after: PipelineState, commands: Commands, terminated: Bool[Array, ""]
     ) -> rewards.Transition:
+        """Inputs of the reward of the step from `before` to `after`."""
         plant = after.plant
         remembers = bool(self.config.follower.observation_averages)
         return rewards.Transition(
@@ -402,7 +408,7 @@ class TransportEnv:
         )
 
     def _spread(self, commands: Float[Array, "followers 3"], rig: Any) -> Float[Array, "followers 3"]:
-        """Commands less their mean over the followers that fly."""
+        """Deviation of each command from the mean over the followers that fly; 0 for padding."""
         if rig == ():
             return commands - commands.mean(axis=0)
         flies = (rig.drone_mass[np.array(self.config.plant.followers)] > 0)[:, None]
@@ -410,24 +416,25 @@ class TransportEnv:
 
     @staticmethod
     def report(totals: Any, peaks: Any, count: float, evaluation: bool) -> dict[str, Any]:
-        """What metrics.csv says of `metrics` summed over `count` steps: arrays (members,), `peaks` (members, worlds).
+        """Columns of metrics.csv, (members,), from `totals` of `metrics` over `count` steps and their maxima, `peaks`.
 
-        steady_error: mean |e_o| later than 8 s into an episode [m]; peak: mean over worlds of the largest; tilt_error,
-        vertical_error: rms difference of the commands to the leader's [rad, m/s2].
+        `totals` (members,), `peaks` (members, worlds). steady_error: mean |e_o| later than 8 s into an episode [m];
+        peak: mean over worlds of its maximum [m]; tilt_error, vertical_error: rms difference between the followers' and
+        the leader's commands [rad, m/s2].
         """
         steady = totals["steady"]
-        nothing = np.where(steady > 0, 0.0, np.nan)
-        found = {"steady_error": totals["steady_error"] / np.maximum(steady, 1) + nothing}
+        nan_if_none = np.where(steady > 0, 0.0, np.nan)
+        columns = {"steady_error": totals["steady_error"] / np.maximum(steady, 1) + nan_if_none}
         if evaluation:
-            found["peak"] = peaks["steady_error"].mean(axis=-1) + nothing
-            found |= {name: np.sqrt(totals[name] / count) for name in ("tilt_error", "vertical_error")}
-        return found
+            columns["peak"] = peaks["steady_error"].mean(axis=-1) + nan_if_none
+            columns |= {name: np.sqrt(totals[name] / count) for name in ("tilt_error", "vertical_error")}
+        return columns
 
 
-def _made_when_called(make: Callable[[], ControlStep]) -> ControlStep:
-    """What `make` returns, made at the first call: programs that only reset worlds need no engine.
+def _lazy_control_step(make: Callable[[], ControlStep]) -> ControlStep:
+    """The control step that `make` returns, built at its first call: programs that only reset worlds need no engine.
 
-    A call may be traced by JAX, and what is made is then no part of what is traced.
+    If JAX traces that call, the engine is built outside the trace.
     """
 
     @functools.cache
@@ -444,7 +451,7 @@ def _made_when_called(make: Callable[[], ControlStep]) -> ControlStep:
 def make_physics(config: Config, physics: str, rig: PlantParameters | None = None) -> ControlStep:
     """The control step of the engine `physics`, mjx or newton-euler, for one world; use `jax.vmap` for many.
 
-    `rig`: the world's own numbers, if they are not those of `config.plant`.
+    `rig`: parameters of the world's plant, if they are not those of `config.plant`.
     """
     make = newton_euler.make_engine
     if physics == "mjx":

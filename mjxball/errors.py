@@ -1,22 +1,22 @@
-"""Errors that a user can cause. Each is one sentence: what was wrong, where, what to do."""
+"""Errors that a user can cause. The message is one sentence: what was wrong, where, what to do."""
 
 
 class InputError(ValueError):
-    """Bad input: printed as one line on stderr, exit code 2, nothing written."""
+    """Invalid input. Programs print it as one line on stderr, exit with code 2, and write nothing."""
 
 
 class TrainingDivergedError(RuntimeError):
-    """A loss or a weight is not finite any more."""
+    """A loss or a weight is no longer finite."""
 
 
-FOREIGN = (Exception, SystemExit)  # what a user's own module may raise: to leave the program is not its to say
+FOREIGN = (Exception, SystemExit)  # exceptions to expect from a user's module, which must not exit the program
 
 
 def said(error: BaseException) -> str:
-    """`error` of a user's own module in one line of printable text."""
+    """Class and message of an `error` from a user's module, as one line of printable text."""
     try:
-        told = str(error)
-    except FOREIGN:  # its own words, too, are somebody else's code
-        told = ""
-    text = "".join(letter if letter.isprintable() else " " for letter in told)
+        message = str(error)
+    except FOREIGN:  # `__str__` may be the user's code
+        message = ""
+    text = "".join(letter if letter.isprintable() else " " for letter in message)
     return f"{type(error).__name__}: {' '.join(text.split())[:160]}"

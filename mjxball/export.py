@@ -20,7 +20,7 @@ from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
 
 
 def policy_of_run(run: Path) -> PolicyFile:
-    """The policy of the newest checkpoint in the run directory `run`."""
+    """The policy of the newest checkpoint in the run directory `run`. Raises InputError unless it is finite."""
     from mjxball.policy.export import is_sound, policy_file
     from mjxball.sim.follower import follower_law
     from mjxball.train.checkpoint import restore_policy
@@ -51,7 +51,7 @@ def _write_onnx(out: Path, policy: PolicyFile) -> None:
     write_whole(out, onnx_model(policy, out.stem).SerializeToString())
 
 
-def _save_rounded(out: Path, policy: PolicyFile) -> None:
+def _save_quantized(out: Path, policy: PolicyFile) -> None:
     from mjxball.policy.quantize import quantized
 
     save_file(out, quantized(policy))
@@ -65,7 +65,7 @@ def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
 
 Writer = Callable[[Path, PolicyFile], None]
 WRITERS: dict[str, Writer] = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
-ROUNDED: dict[str, Writer] = {".npz": _save_rounded, ".h": functools.partial(_write_header, int8=True)}  # with --int8
+INT8_WRITERS: dict[str, Writer] = {".npz": _save_quantized, ".h": functools.partial(_write_header, int8=True)}
 
 
 def export(
@@ -75,12 +75,12 @@ def export(
     plant: Path | None = None,
     drone: int | None = None,
 ) -> None:
-    """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails.
+    """Export `source` to the new file `out`, in the format of its suffix. Raises InputError if that is impossible.
 
-    `int8`: weights of 8 bits in a header, floats rounded to them in a policy file. `plant`, `drone`: see `in_team`; a
-    policy file need not be told them.
+    `int8`: 8-bit weights in a header, floats rounded to them in a policy file. `plant`, `drone`: see `in_team`; they
+    are optional for a policy file.
     """
-    if int8 and out.suffix not in ROUNDED:
+    if int8 and out.suffix not in INT8_WRITERS:
         raise InputError("--int8 is for an output file that ends in .h or .npz")
     if out.suffix not in WRITERS:
         raise InputError(f"output file {out} must end in {', '.join(WRITERS)}, which chooses the format")
@@ -88,7 +88,7 @@ def export(
     policy = contents_of(source)
     if out.suffix != ".npz" or plant is not None or drone is not None:
         policy = in_team(policy, source.stem, plant, drone)
-    (ROUNDED if int8 else WRITERS)[out.suffix](out, policy)
+    (INT8_WRITERS if int8 else WRITERS)[out.suffix](out, policy)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -109,7 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def add_source(parser: Parser) -> None:
-    """What is exported: a follower, and the team in which it flies."""
+    """Add the arguments for the follower to export and the team in which it flies."""
     about = "policy file, name of a shipped one, or run directory of train.py"
     parser.add_argument("source", metavar="POLICY|RUN", type=policy_path, help=about)
     plants = f"{', '.join(configs.PLANTS)}, or a rig in TOML, JSON, MJCF or URDF"

@@ -1,4 +1,4 @@
-"""Files of users and for users: read within bounds, whatever they are; written whole, or not at all."""
+"""Reading of users' files within bounds, and atomic writing."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathlib import Path
 
 from mjxball.errors import InputError
 
-MAX_BYTES = 16 * 2**20  # of a text; JSON and CSV take some ten times their own length in memory
+MAX_BYTES = 16 * 2**20  # of a text; parsed JSON and CSV take about ten times as much memory
 
 
 class MissingFileError(InputError):
-    """There is no such file."""
+    """The file does not exist."""
 
 
 def read_bytes(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BYTES) -> bytes:
-    """The contents of the file `path`, `limit` bytes at most.
+    """The contents of the file `path`, at most `limit` bytes.
 
-    `kind` says in the error what it should be, '' for nothing but its path. Raises MissingFileError, or InputError if
-    it cannot be read, is too large, or is no regular file: a pipe would be waited for, a device never ends.
+    `kind` describes the file in errors; with '' these contain the path alone. Raises MissingFileError, or InputError if
+    the file cannot be read, is too large, or is not regular: reading a pipe may block, and a device may never end.
     """
     called = f"{kind}{' ' if kind else ''}{path}"
     try:
@@ -46,7 +46,7 @@ def read_bytes(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BY
 
 
 def read_text(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BYTES) -> str:
-    """The same of a text in UTF-8, with line ends as they are, without the byte order mark that some editors write."""
+    """`read_bytes`, decoded from UTF-8. Line ends are unchanged, and a byte order mark is dropped."""
     content = read_bytes(path, kind, limit)
     called = f"{kind}{' ' if kind else ''}{path}"
     if is_utf16(content):
@@ -58,14 +58,14 @@ def read_text(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BYT
 
 
 def is_utf16(content: bytes) -> bool:
-    """Whether `content` begins as a text in UTF-16 or UTF-32, with their byte order mark, does."""
+    """Whether `content` begins with a byte order mark of UTF-16 or UTF-32."""
     return content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE))
 
 
 def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
-    """Write `data`, a text in UTF-8, to `path` atomically: whoever reads sees the old file or the whole new one.
+    """Write `data`, text as UTF-8, to `path` atomically: readers see the old file or the complete new one.
 
-    So it is after a loss of power, too. Several may write at once: the last one's file stays. An OSError names `path`.
+    This holds after a loss of power too. Of simultaneous writes, the last one remains. An OSError names `path`.
     """
     target = Path(path)
     content = data.encode() if isinstance(data, str) else data
@@ -84,7 +84,7 @@ def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
 
 
 def user_cache() -> Path | None:
-    """The folder for what is kept between runs and can be made again; None for whoever has no home directory."""
+    """Folder for files that can be regenerated; None for a user without a home directory."""
     base = os.environ.get("XDG_CACHE_HOME")
     try:
         return (Path(base) if base else Path.home() / ".cache") / "mjxball"
@@ -93,7 +93,7 @@ def user_cache() -> Path | None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the folder's new entry on disk; where a file system cannot, it is there as soon as it may be."""
+    """Flush the folder's entries to disk, if the file system supports that."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""A flight in a notebook, in the viewer of `python -m mjxball.view`."""
+"""The viewer of `python -m mjxball.view` in a notebook."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mjxball.view.page import flight_page
 
 
 class View:
-    """What a notebook shows as the viewer, inside its page: nothing is written, and no server runs."""
+    """A flight that a notebook displays in the viewer, embedded in its page without files or a server."""
 
     def __init__(self, flight: Trajectory, plant: Plant, title: str = "flight", height: int = 560):
-        """One flight, without a batch axis, of `plant`; `height` in pixels."""
+        """`flight` of `plant` without a batch axis; `height` of the viewer [pixels]."""
         self._page, self._title, self._height = flight_page(flight_of(flight, plant, title)), title, height
 
     def __repr__(self) -> str:

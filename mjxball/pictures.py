@@ -1,4 +1,4 @@
-"""Small pictures as SVG text for notebooks, from the standard library alone: curves, and the plan of a rig."""
+"""Small SVG figures for notebooks and pages, without dependencies: curves, and the plan view of a rig."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-# Of everything that is drawn. Distinct with protanopia and deuteranopia, at least 3 : 1 from white and dark pages.
+# Palette of all figures: distinct with protanopia and deuteranopia, contrast at least 3 : 1 on white and dark pages.
 COLOURS = ("#1f5aff", "#98623a", "#318174", "#ff0f87", "#469ab9", "#b28f00")
 MOST_POINTS = 400  # of a curve
 SMALL = 'font-size="11" fill="currentColor"'
 
 
 class Curve(NamedTuple):
-    """A line, or with `dots` single points."""
+    """A line, or with `dots` separate points."""
 
     name: str
     x: Any  # sequences or arrays of numbers
@@ -23,7 +23,7 @@ class Curve(NamedTuple):
 
 
 def curves(shown: Sequence[Curve], x_label: str, y_label: str, width: int = 480, height: int = 170) -> str:
-    """The curves over common axes; what is not finite is left out."""
+    """SVG of curves over common axes. Points that are not finite are left out."""
     lines = [(one, [(x, y) for x, y in _thinned(one) if math.isfinite(x) and math.isfinite(y)]) for one in shown]
     points = [point for _, line in lines for point in line] or [(0.0, 0.0)]
     (left, right), (low, high) = (_range(values) for values in zip(*points, strict=True))
@@ -62,10 +62,10 @@ def plan(
     edges: Sequence[float],
     held: Sequence[float] = (),
 ) -> str:
-    """A rig from above, x to the right: its box, and each drone with the reach of its rotors; the leader filled.
+    """SVG of a rig from above, x to the right: its box, and a circle of the radius `arms` for each drone [m].
 
-    With `held` it is a page's picture: drones have numbers, there is a scale, and an ellipse with these half axes
-    (x, y) shows where the load's CG may rest [m].
+    The leader's circle is filled. With `held`, for a page, drones are numbered, there is a scale bar, and an ellipse
+    with these half axes (x, y) shows where the load's CG may rest [m].
     """
     places = [(float(mount[0]), float(mount[1])) for mount in mounts]
     reach = max([*(max(abs(x), abs(y)) + arm for (x, y), arm in zip(places, arms, strict=True)), *edges[:2], 1e-9])
@@ -102,7 +102,7 @@ def plan(
 
 
 def card(title: str, facts: Mapping[str, object], picture: str = "") -> str:
-    """Title, facts and picture as HTML."""
+    """HTML of a title, `facts` as lines of name and value, and an SVG `picture`."""
     rows = "".join(
         f"<div><b>{html.escape(str(name))}</b> {html.escape(str(value))}</div>" for name, value in facts.items()
     )
@@ -116,6 +116,7 @@ def _svg(width: int, height: int, parts: Sequence[str]) -> str:
 
 
 def _thinned(curve: Curve) -> list[tuple[float, float]]:
+    """At most `MOST_POINTS` points of `curve`, evenly spaced in its index."""
     step = max(1, math.ceil(len(curve.x) / MOST_POINTS))
     return [(float(x), float(y)) for x, y in zip(curve.x[::step], curve.y[::step], strict=True)]
 

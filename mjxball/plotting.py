@@ -1,4 +1,4 @@
-"""Matplotlib as everything here uses it: without a window, one look for each follower, on light and dark pages."""
+"""Matplotlib figures: no window, fixed line styles of followers, styles for screen (light and dark) and paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARKERS = dict(zip(COLOURS, "osD^vP", strict=True))
 SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(
     (0, marks) for marks in (None, (5, 2), (1, 1.5), (5, 2, 1, 2), (5, 2, 1, 2, 1, 2), (12, 2), (2.5, 1))
 )
-# A row of dashes: followers in the order of COLOURS. What is often drawn together differs in colour, too.
+# For each dash the followers in the order of COLOURS. Followers that often share a figure differ in colour too.
 TABLE = (
     (SOLID, ("stand", "flight", "balance", "universal", "sac", "flight-upgrade")),
     (DASH_DOT_DOT, ("", "robust", "", "transport", "flight-brushless", "paper")),
@@ -34,18 +34,18 @@ LOOKS = {
     for colour, name in zip(COLOURS, names, strict=True)
     if name
 }
-# For all other names: dashes and markers that none of the table has. The first twelve differ without their markers.
+# Styles of other names: dashes and markers that are not in TABLE. The first twelve differ in colour or dash alone.
 FREE = tuple(
     (colour, (LONG, SHORT)[turn % 2], "X*hp<d"[(k + turn) % len(COLOURS)])
     for turn in range(len(COLOURS))
     for k, colour in enumerate(COLOURS)
 )
-SIMULATED = "the same, simulated"  # beside a flight that was flown
+SIMULATED = "the same, simulated"  # label of the simulation beside a real flight
 
 _COMMON = {"text.parse_math": False, "svg.fonttype": "none", "pdf.fonttype": 42, "legend.frameon": False}
 _INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
 _LETTERS = ("font.size", "axes.titlesize", "axes.labelsize", "legend.fontsize", "xtick.labelsize", "ytick.labelsize")
-# The width is that of a figure with one column [in]; a screen's is readable on a phone.
+# `figure.figsize` is that of a figure with one column [in]; on screen it is readable on a phone.
 STYLES: dict[str, dict[str, Any]] = {
     "screen": {
         **_COMMON,
@@ -68,7 +68,7 @@ STYLES: dict[str, dict[str, Any]] = {
 
 @cache
 def pyplot() -> Any:
-    """Matplotlib's pyplot on the file-only backend. Dollars in a name are dollars, and begin no formula."""
+    """Matplotlib's pyplot on the file-only backend. A dollar sign in a name does not start a formula."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -84,36 +84,36 @@ def style(name: str) -> Any:
 
 
 def file_format() -> str:
-    """Of the figures of the style in force: svg or pdf."""
+    """File format of the current style: svg or pdf."""
     return str(pyplot().rcParams["savefig.format"])
 
 
 def follower_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour, dash and marker of each follower of one figure, as arguments of `plot`.
 
-    Those of `TABLE` are fixed. Another name has a place of `FREE` that no other name of the figure has, of the colours
-    that are there least often the one that its checksum says. The colour of `copy`, which stands in most figures,
-    counts as if it were there.
+    Names in `TABLE` have fixed styles. Another name gets a style of `FREE` that is unused in the figure, in one of the
+    colours that occur least often, chosen by the name's checksum. The colour of `copy`, which most figures contain,
+    always counts as used.
     """
-    known = {name: LOOKS.get(re.sub(r"(, flown| \(FORCED\))*$", "", name)) for name in sorted(set(names))}
-    drawn = [look for look in (LOOKS["copy"], *known.values()) if look]
-    for name in (name for name, look in known.items() if look is None):
-        place, times = zlib.crc32(name.encode()), Counter(look[:kept] for look in drawn for kept in (1, 2, 3))
+    looks = {name: LOOKS.get(re.sub(r"(, flown| \(FORCED\))*$", "", name)) for name in sorted(set(names))}
+    used = [look for look in (LOOKS["copy"], *looks.values()) if look]
+    for name in (name for name, look in looks.items() if look is None):
+        checksum, times = zlib.crc32(name.encode()), Counter(look[:length] for look in used for length in (1, 2, 3))
         ranks = [
-            (times[look], times[look[:2]], times[look[:1]], (k - place) % len(COLOURS), k // len(COLOURS))
+            (times[look], times[look[:2]], times[look[:1]], (k - checksum) % len(COLOURS), k // len(COLOURS))
             for k, look in enumerate(FREE)
         ]
-        known[name] = own = FREE[ranks.index(min(ranks))]
-        drawn.append(own)
-    looks = {name: _arguments(*look) for name, look in known.items() if look}
-    if SIMULATED in looks:
-        looks = {name: {**look, "linewidth": 0.8} for name, look in looks.items()}
-        looks[SIMULATED] = {"color": INK, "linewidth": 4.0, "alpha": 0.4, "zorder": 1.5, "marker": "none"}
-    return looks
+        looks[name] = chosen = FREE[ranks.index(min(ranks))]
+        used.append(chosen)
+    styles = {name: _arguments(*look) for name, look in looks.items() if look}
+    if SIMULATED in styles:
+        styles = {name: {**given, "linewidth": 0.8} for name, given in styles.items()}
+        styles[SIMULATED] = {"color": INK, "linewidth": 4.0, "alpha": 0.4, "zorder": 1.5, "marker": "none"}
+    return styles
 
 
 def series_styles(labels: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The same for curves that are not of different followers, in order."""
+    """Arguments of `plot` for curves that do not stand for followers, by their order."""
     colours = [COLOURS[k % len(COLOURS)] for k in range(len(labels))]
     dashes = [DASHES[k % len(DASHES)] for k in range(len(labels))]
     looks = zip(labels, colours, dashes, strict=True)
@@ -125,25 +125,25 @@ def _arguments(colour: str, dash: Any, marker: str) -> dict[str, Any]:
 
 
 def line(look: Mapping[str, Any]) -> dict[str, Any]:
-    """`look` without its marker, for curves of many points."""
+    """`look` (arguments of `plot`) without its marker, for curves of many points."""
     return {**look, "marker": "none"}
 
 
 def logarithmic(axes: Any, scale: str = "log", **given: Any) -> None:
-    """Make y of `axes` logarithmic. Its ticks are plain numbers: Matplotlib's own are formulas, see `pyplot`."""
+    """Make the y-axis of `axes` logarithmic, with plain numbers as ticks, not Matplotlib's formulas (see `pyplot`)."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     axes.set_yscale(scale, **given)
     ends = [abs(end) for end in axes.get_ylim() if end]
     if scale == "log" or min(axes.get_ylim()) * max(axes.get_ylim()) > 0:
-        few = max(ends) < 50 * min(ends)  # then decades alone are hardly a tick
+        few = max(ends) < 50 * min(ends)  # decades alone would give hardly any tick
         axes.yaxis.get_major_locator().set_params(subs=(1.0, 2.0, 5.0) if few else (1.0,))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def legend_above(figure: Any, axes: Iterable[Any], columns: int = 4, title: str | None = None) -> None:
-    """One legend above the panels, off their curves, with every label of `axes` once."""
+    """Add one legend above the panels, outside their curves, with every label of `axes` once."""
     handles: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -154,13 +154,13 @@ def legend_above(figure: Any, axes: Iterable[Any], columns: int = 4, title: str 
 
 
 def rendered(figure: Any, ending: str | None = None) -> bytes:
-    """The figure as a file of the format `ending`, without one of the style's; it is closed.
+    """Contents of a file of the format `ending` (default: the style's) with the figure, which is closed.
 
-    SVG is transparent, with text as text. No date is in it, so that equal figures are equal files.
+    SVG is transparent and keeps text as text. Files contain no date, so that equal figures are equal files.
     """
     ending, stream = ending or file_format(), io.BytesIO()
     if ending == "svg":
-        # Ids are drawn from the content, so that figures of one page do not share clip paths.
+        # Ids are hashes of the content, so that figures on one page do not share clip paths.
         figure.savefig(stream, format=ending, transparent=True, metadata={"Date": None, "Creator": None})
     elif ending == "pdf":
         figure.savefig(stream, format=ending, metadata={"CreationDate": None})
@@ -175,5 +175,5 @@ def rendered(figure: Any, ending: str | None = None) -> bytes:
 
 
 def save(figure: Any, path: Path) -> None:
-    """Write the picture `path`, whole or not at all; its ending is the format. The figure is closed."""
+    """Write the figure to `path` atomically, in the format of its suffix, and close it."""
     write_whole(path, rendered(figure, path.suffix.removeprefix(".")))

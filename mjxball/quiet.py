@@ -1,4 +1,4 @@
-"""Imports of libraries that would otherwise print notes of no use to a user, or load PyTorch."""
+"""Imports of libraries without the notes that they print or the PyTorch that they load."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 
 def quietly(name: str) -> Any:
-    """The module `name`, imported without what it prints: MJX, also behind Brax, says that NVIDIA Warp is absent."""
+    """Import the module `name` without output. MJX, which Brax imports too, prints that NVIDIA Warp is absent."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         return importlib.import_module(name)
 
@@ -28,10 +28,10 @@ def import_brax_env() -> tuple[type, type]:
 
 
 def import_tensorboard() -> Any:
-    """tensorboardX, without PyTorch, which it would load (5 s) where that is installed."""
+    """tensorboardX, without PyTorch, which it would import (5 s) if it is installed."""
     if "torch" in sys.modules:
         return importlib.import_module("tensorboardX")
-    sys.modules["torch"] = None  # type: ignore[assignment]  # what Python raises ImportError for
+    sys.modules["torch"] = None  # type: ignore[assignment]  # makes `import torch` raise ImportError
     try:
         return importlib.import_module("tensorboardX")
     finally:

@@ -14,38 +14,38 @@ if TYPE_CHECKING:
 
 
 class Transition(NamedTuple):
-    """What a reward may depend on: the truth after one control step, and what was commanded in it.
+    """Inputs of a reward: the true state after one control step, and the commands during it.
 
-    Of several followers `action`, `last_action`, `action_average`, `follower_command`, `tilt_disagreement` and `spread`
-    have an axis for them, and so has the reward.
+    With several followers `action`, `last_action`, `action_average`, `follower_command`, `tilt_disagreement` and
+    `spread` have a followers' axis, and so has the reward.
     """
 
-    error: Vector  # e_o, goal less position of O [m]
+    error: Vector  # e_o, goal minus position of O [m]
     velocity: Vector  # of O [m/s]
     euler: Vector  # roll, pitch, yaw [rad]
     rates: Vector  # about the body axes [rad/s]
     action: Vector  # of the network in [-1, 1]
-    last_action: Vector  # the one before
-    command_change: Vector  # of the follower's command since the step before [rad, m/s2]
-    action_average: Vector | None  # over the longest of `follower.observation_averages`; None: there is none
+    last_action: Vector  # action of the previous step
+    command_change: Vector  # change of the follower's command since the previous step [rad, m/s2]
+    action_average: Vector | None  # over the longest of `follower.observation_averages`, None without any
     leader_command: Vector  # roll, pitch [rad], vertical acceleration [m/s2]
-    follower_command: Vector  # likewise
-    tilt_disagreement: Scalar  # follower's less leader's command about the axis that no load turns [rad]
-    spread: Vector | None  # a follower's command less the mean of all followers' [rad, m/s2]; None: there is one
-    ball: Float[Array, "... directions"]  # a rolling ball's offset along the load's directions over its end stop's
+    follower_command: Vector  # the same for the follower
+    tilt_disagreement: Scalar  # follower's minus leader's command about the axis without CG torque [rad]
+    spread: Vector | None  # follower's command minus the mean over followers [rad, m/s2], None with one follower
+    ball: Float[Array, "... directions"]  # offset of a rolling ball along the load's directions, over the end stop's
     terminated: Bool[Array, "..."]  # whether the episode ended by leaving the termination distance or by diverging
 
 
 def paper_reward(leader_command: Vector, follower_command: Vector) -> Scalar:
-    """-10 (|az_l - az_f| + |phi_l - phi_f| + |theta_l - theta_f|) of two commands (the paper's)."""
+    """The paper's reward, -10 (|az_l - az_f| + |phi_l - phi_f| + |theta_l - theta_f|), of two commands (..., 3)."""
     xp = leader_command.__array_namespace__()
     return -10.0 * xp.abs(leader_command - follower_command).sum(axis=-1)
 
 
 def task_reward(weights: Reward, step: Transition) -> Scalar:
-    """Minus a weighted sum of costs (ours); every term but that of `weights.termination`.
+    """Task reward (ours): minus a weighted sum of costs, without the cost of a termination.
 
-    The error's cost is a pseudo-Huber: |e| / scale far away, (e / scale)^2 / 2 near the goal.
+    The cost of the error is a pseudo-Huber loss: |e| / scale far away, (e / scale)^2 / 2 near the goal.
     """
     xp = step.error.__array_namespace__()
 
@@ -79,13 +79,13 @@ def task_reward(weights: Reward, step: Transition) -> Scalar:
 
 
 def _used(weight: Scalar | float) -> bool:
-    """False for a weight of 0; one that a sweep traces may be anything."""
+    """False for a weight of 0. In a sweep the weight is traced and its value unknown."""
     return not isinstance(weight, (int, float)) or weight != 0
 
 
 def reward(weights: Reward, step: Transition) -> Scalar:
-    """The reward of `weights.kind`, less the cost of a termination."""
+    """The reward of `weights.kind`, minus the cost of a termination."""
     xp = step.error.__array_namespace__()
     paper = weights.kind == "paper"
-    earned = paper_reward(step.leader_command, step.follower_command) if paper else task_reward(weights, step)
-    return earned - xp.where(step.terminated, weights.termination, 0.0)
+    running = paper_reward(step.leader_command, step.follower_command) if paper else task_reward(weights, step)
+    return running - xp.where(step.terminated, weights.termination, 0.0)

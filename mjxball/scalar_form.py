@@ -1,4 +1,4 @@
-"""A function of small arrays as operations on single numbers, which XLA fuses into few loops over the batch."""
+"""Scalar form: a function of small arrays as operations on scalars, which XLA fuses into few loops over the batch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from jax.extend import core
 
 Value = Any  # an array, or `Parts`
-Parts = Any  # object array with a tracer or a NumPy scalar for each number
-LARGEST = 12  # numbers; operations on larger arrays stay as they are: apart they compile longer and run no sooner
+Parts = Any  # object array, each element a tracer (of the batch, or a scalar) or a NumPy scalar
+LARGEST = 12  # size; operations on larger arrays are kept, since in scalar form they compile longer and run no faster
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 ELEMENTWISE = frozenset(
     (
@@ -36,13 +36,13 @@ REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.vmap(function)` for a `function` of pytrees of arrays, computed number by number for all of the batch.
+    """`jax.vmap(function)` for a `function` of pytrees of arrays, computed element by element over the batch.
 
-    Slices, stacks and transposes of small arrays vanish, products with constants that are 0 as well (0 times infinity
-    then is 0), and sums are added in order. A `lax.scan` without inputs and outputs for each step, as `fori_loop` of a
-    fixed count becomes, is computed again when its gradient is taken instead of remembering what happened in it. What
-    is unknown here or larger than `LARGEST` stays as it is, and so does a call (`jax.jit`) with such an array in it.
-    It has gradients backwards alone (`jax.grad`, `jax.vjp`).
+    Slices, stacks and transposes of small arrays vanish, and so do products with constants that are 0 (0 times infinity
+    is then 0). Sums are added in order. A `lax.scan` without inputs and outputs for each step, such as `fori_loop` of a
+    fixed count, is recomputed for its gradient instead of storing intermediate values. Operations that are unknown here
+    or have an array larger than `LARGEST` are kept, and so is a call (`jax.jit`) that contains one.
+    The result has reverse-mode gradients only (`jax.grad`, `jax.vjp`).
     """
 
     def transformed(*arguments: Any) -> Any:
@@ -51,20 +51,20 @@ def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
         closed, result = jax.make_jaxpr(
             lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), return_shape=True
         )(*shapes)
-        values = _evaluate(closed.jaxpr, closed.consts, _apart(leaves))
+        values = _evaluate(closed.jaxpr, closed.consts, _split(leaves))
         count = jnp.shape(leaves[0])[:1]
         outputs = [_array(value, v.aval) for value, v in zip(values, closed.jaxpr.outvars, strict=True)]
-        whole = [
+        batched = [
             one if jnp.ndim(one) > len(v.aval.shape) else jnp.broadcast_to(one, (*count, *v.aval.shape))
             for one, v in zip(outputs, closed.jaxpr.outvars, strict=True)
         ]
-        return jax.tree.unflatten(jax.tree.structure(result), whole)
+        return jax.tree.unflatten(jax.tree.structure(result), batched)
 
     return transformed
 
 
-def _apart(leaves: Sequence[Any]) -> list[Value]:
-    """`leaves` with the numbers of small arrays apart, whose gradients are put together array by array."""
+def _split(leaves: Sequence[Any]) -> list[Value]:
+    """`leaves` (batch, ...) with small arrays as `Parts`. Gradients of an array's elements are stacked once."""
     small = [
         k
         for k, leaf in enumerate(leaves)
@@ -73,30 +73,30 @@ def _apart(leaves: Sequence[Any]) -> list[Value]:
     shapes = [leaves[k].shape for k in small]
 
     @jax.custom_vjp
-    def numbers(*arrays: Any) -> list[list[Any]]:
-        return [_numbers(array, 1) for array in arrays]
+    def elements(*arrays: Any) -> list[list[Any]]:
+        return [_elements(array, 1) for array in arrays]
 
-    def together(_: None, slopes: list[list[Any]]) -> tuple[Any, ...]:
-        return tuple(jnp.stack(slope, 1).reshape(shape) for slope, shape in zip(slopes, shapes, strict=True))
+    def stacked(_: None, gradients: list[list[Any]]) -> tuple[Any, ...]:
+        return tuple(jnp.stack(gradient, 1).reshape(shape) for gradient, shape in zip(gradients, shapes, strict=True))
 
-    numbers.defvjp(lambda *arrays: (numbers(*arrays), None), together)
-    found: list[Value] = list(leaves)
-    for k, shape, flat in zip(small, shapes, numbers(*(leaves[k] for k in small)), strict=True):
-        found[k] = _shaped(flat, shape[1:])
-    return found
+    elements.defvjp(lambda *arrays: (elements(*arrays), None), stacked)
+    values: list[Value] = list(leaves)
+    for k, shape, flat in zip(small, shapes, elements(*(leaves[k] for k in small)), strict=True):
+        values[k] = _shaped(flat, shape[1:])
+    return values
 
 
-def _numbers(array: Any, batched: int) -> list[Any]:
-    """The numbers of an array, in order; with 1 for `batched` its first axis is the batch."""
+def _elements(array: Any, batched: int) -> list[Any]:
+    """The elements of `array` in row-major order, without its first axis, the batch, if `batched` is 1."""
     flat = jax.lax.reshape(array, (*array.shape[:batched], math.prod(array.shape[batched:])))
     each = range(flat.shape[-1])
     return [jax.lax.squeeze(jax.lax.slice_in_dim(flat, k, k + 1, axis=batched), (batched,)) for k in each]
 
 
-def _shaped(numbers: Sequence[Any], shape: tuple[int, ...]) -> Parts:
+def _shaped(elements: Sequence[Any], shape: tuple[int, ...]) -> Parts:
     parts = np.empty(shape, object)
-    for index, number in zip(np.ndindex(shape), numbers, strict=True):
-        parts[index] = number
+    for index, element in zip(np.ndindex(shape), elements, strict=True):
+        parts[index] = element
     return parts
 
 
@@ -115,37 +115,38 @@ def _evaluate(jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Value]) 
 
 
 def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
-    """What `equation` makes of `inputs`."""
+    """Results of `equation` for `inputs`, in scalar form if it is known and small."""
     name, parameters = equation.primitive.name, equation.params
     if name in CALLS and parameters.get(CALLS[name]) is not None:
         called = parameters[CALLS[name]]
         if _largest(called.jaxpr) > LARGEST:
-            return _as_it_is(equation, inputs)
+            return _on_arrays(equation, inputs)
         return _evaluate(called.jaxpr, called.consts, inputs)
     if name == "scan" and _repeats(equation):
         return _scan(parameters["jaxpr"], parameters["length"], inputs)
     avals, shape = [variable.aval for variable in (*equation.invars, *equation.outvars)], equation.outvars[0].aval.shape
-    alike = all(_spreads(aval.shape, shape) for aval in avals)  # a change of type may turn one number into several
-    rewritten = (name in ELEMENTWISE and alike) or name in REDUCTIONS or name in REARRANGED
+    # A change of type (`bitcast_convert_type`) may turn one element into several.
+    broadcasts = all(_broadcasts_to(aval.shape, shape) for aval in avals)
+    rewritten = (name in ELEMENTWISE and broadcasts) or name in REDUCTIONS or name in REARRANGED
     keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
     sizes = [aval.size for aval in avals]
     if keys or not rewritten or max(sizes) > LARGEST or min(sizes) == 0:
-        return _as_it_is(equation, inputs)
+        return _on_arrays(equation, inputs)
     parts = [_parts(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
     if name in REARRANGED:
         result = REARRANGED[name](parameters, shape, parts)
         return result if equation.primitive.multiple_results else [result]
     if name in REDUCTIONS:
         return [_reduce(REDUCTIONS[name], parts[0], parameters["axes"])]
-    spread = [np.broadcast_to(part, shape) for part in parts]
+    operands = [np.broadcast_to(part, shape) for part in parts]
     outputs = np.empty(shape, object)
     for index in np.ndindex(shape):
-        outputs[index] = _compute(equation, [part[index] for part in spread])
+        outputs[index] = _compute(equation, [part[index] for part in operands])
     return [outputs]
 
 
-def _as_it_is(equation: Any, inputs: list[Value]) -> Sequence[Value]:
-    """What `equation` makes of `inputs`, on arrays."""
+def _on_arrays(equation: Any, inputs: list[Value]) -> Sequence[Value]:
+    """Results of `equation` for `inputs`, computed on whole arrays by `jax.vmap`."""
     arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
     pairs = zip(arrays, equation.invars, strict=True)
     axes = tuple(0 if jnp.ndim(array) > len(variable.aval.shape) else None for array, variable in pairs)
@@ -155,61 +156,61 @@ def _as_it_is(equation: Any, inputs: list[Value]) -> Sequence[Value]:
 
 
 def _largest(jaxpr: Any) -> int:
-    """Numbers of the largest array in `jaxpr`."""
+    """Size of the largest array in `jaxpr`."""
     return max((v.aval.size for e in jaxpr.eqns for v in (*e.invars, *e.outvars) if hasattr(v.aval, "size")), default=0)
 
 
-def _spreads(own: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Whether an operand of shape `own` is spread over `shape` as NumPy does it, without further axes."""
-    return own == () or (
-        len(own) == len(shape) and all(one in (1, other) for one, other in zip(own, shape, strict=True))
+def _broadcasts_to(operand: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Whether an array of the shape `operand`, a scalar or with as many axes as `shape`, broadcasts to `shape`."""
+    return operand == () or (
+        len(operand) == len(shape) and all(one in (1, other) for one, other in zip(operand, shape, strict=True))
     )
 
 
 def _repeats(scan: Any) -> bool:
-    """Whether `scan` has neither inputs nor outputs for each step: those have an axis more outside than inside."""
+    """Whether `scan` has no inputs or outputs for each step, which would have one more axis than in its body."""
     body = scan.params["jaxpr"]
     inner, outer = [*body.in_avals, *body.out_avals], [v.aval for v in (*scan.invars, *scan.outvars)]
     return all(one.shape == other.shape for one, other in zip(inner, outer, strict=True))
 
 
 def _scan(body: Any, length: int, inputs: list[Value]) -> list[Value]:
-    """`length` times `body`, whose last inputs are what it returns."""
+    """`body` repeated `length` times. Its last inputs are carried; those before them are the same in every step."""
     count = len(inputs) - len(body.out_avals)
     shapes = body.out_avals
     parts = [_parts(value, aval) for value, aval in zip(inputs, body.in_avals, strict=True)]
     batch = _batch([one for part in parts for one in part.flat])
 
-    def numbers(values: Sequence[Value]) -> list[Any]:
+    def flatten(values: Sequence[Value]) -> list[Any]:
         every = [(one, aval.dtype) for v, aval in zip(values, shapes, strict=True) for one in _parts(v, aval).flat]
         return [jnp.broadcast_to(jnp.asarray(one, kind), batch) for one, kind in every]
 
-    def values(flat: Sequence[Any]) -> list[Parts]:
-        found, rest = [], list(flat)
+    def unflatten(flat: Sequence[Any]) -> list[Parts]:
+        values, rest = [], list(flat)
         for aval in shapes:
-            found.append(_shaped(rest[: aval.size], aval.shape))
+            values.append(_shaped(rest[: aval.size], aval.shape))
             rest = rest[aval.size :]
-        return found
+        return values
 
-    # What stays the same: the traced numbers among it are differentiated, too.
+    # Traced elements of the inputs that stay the same are arguments of the loop, because they have gradients.
     same = parts[:count]
     traced = [one for part in same for one in part.flat if not _is_constant(one)]
 
     def step(traced: list[Any], flat: list[Any]) -> list[Any]:
         rest = iter(traced)
         filled = [np.empty(part.shape, object) for part in same]
-        for part, own in zip(filled, same, strict=True):
-            for index in np.ndindex(own.shape):
-                part[index] = own[index] if _is_constant(own[index]) else next(rest)
-        return numbers(_evaluate(body.jaxpr, body.consts, [*filled, *values(flat)]))
+        for part, template in zip(filled, same, strict=True):
+            for index in np.ndindex(template.shape):
+                part[index] = template[index] if _is_constant(template[index]) else next(rest)
+        return flatten(_evaluate(body.jaxpr, body.consts, [*filled, *unflatten(flat)]))
 
-    return values(_repeated(step, length)(traced, numbers(parts[count:])))
+    return unflatten(_repeated(step, length)(traced, flatten(parts[count:])))
 
 
 def _repeated(step: Callable[[list[Any], list[Any]], list[Any]], length: int) -> Callable[..., list[Any]]:
-    """`f(same, value)`: `length` times value = step(same, value).
+    """Function (same, value) that repeats value = step(same, value) `length` times.
 
-    Its gradient is written out, since to let JAX find that of a loop of `jax.checkpoint` takes a second longer.
+    Its gradient is explicit, because JAX takes a second longer to derive that of a loop with `jax.checkpoint`.
     """
 
     @jax.custom_vjp
@@ -220,33 +221,35 @@ def _repeated(step: Callable[[list[Any], list[Any]], list[Any]], length: int) ->
         last, every = jax.lax.scan(lambda value, _: (step(same, value), value), value, length=length)
         return last, (same, every)
 
-    def backward(kept: Any, slope: list[Any]) -> tuple[list[Any], list[Any]]:
-        same, every = kept
+    def backward(residuals: Any, gradient: list[Any]) -> tuple[list[Any], list[Any]]:
+        same, every = residuals
 
         def back(carry: tuple[list[Any], list[Any]], value: list[Any]) -> tuple[Any, None]:
-            slope, total = carry
+            gradient, total = carry
             _, pull = jax.vjp(step, same, value)
-            more, slope = pull(slope)
-            return (slope, [a + b for a, b in zip(total, more, strict=True)]), None
+            more, gradient = pull(gradient)
+            return (gradient, [a + b for a, b in zip(total, more, strict=True)]), None
 
-        nothing = [jnp.zeros_like(one) for one in same]
-        (slope, total), _ = jax.lax.scan(back, (slope, nothing), every, reverse=True)
-        return total, slope
+        zeros = [jnp.zeros_like(one) for one in same]
+        (gradient, total), _ = jax.lax.scan(back, (gradient, zeros), every, reverse=True)
+        return total, gradient
 
     repeat.defvjp(forward, backward)
     return repeat
 
 
 def _parts(value: Value, aval: Any) -> Parts:
+    """`value` as `Parts` of the shape of `aval`, which is without the batch."""
     if isinstance(value, np.ndarray) and value.dtype == object:
         return value
     batched = jnp.ndim(value) - len(aval.shape)
     if batched or isinstance(value, jax.core.Tracer):
-        return _shaped(_numbers(value, batched), aval.shape)
+        return _shaped(_elements(value, batched), aval.shape)
     return _shaped(list(np.asarray(value).ravel()), aval.shape)
 
 
 def _array(value: Value, aval: Any) -> Any:
+    """`value` as one array, with the batch axis first if any element has one."""
     if not (isinstance(value, np.ndarray) and value.dtype == object):
         return value
     if all(map(_is_constant, value.flat)):
@@ -254,21 +257,21 @@ def _array(value: Value, aval: Any) -> Any:
     batch = _batch(value.flat)
     if not aval.shape:
         return jnp.asarray(value[()], aval.dtype)
-    numbers = [jnp.broadcast_to(jnp.asarray(number, aval.dtype), batch) for number in value.flat]
-    return jnp.stack(numbers, len(batch)).reshape(batch + aval.shape)
+    elements = [jnp.broadcast_to(jnp.asarray(element, aval.dtype), batch) for element in value.flat]
+    return jnp.stack(elements, len(batch)).reshape(batch + aval.shape)
 
 
-def _is_constant(number: Any) -> bool:
-    return isinstance(number, np.generic)
+def _is_constant(element: Any) -> bool:
+    return isinstance(element, np.generic)
 
 
-def _batch(numbers: Iterable[Any]) -> tuple[int, ...]:
-    """Shape of what all of `numbers` are together: that of the batch, or () if none of them is of one."""
-    return np.broadcast_shapes(*(np.shape(number) for number in numbers))
+def _batch(elements: Iterable[Any]) -> tuple[int, ...]:
+    """Shape of the batch, (n,), or () if none of `elements` has a batch axis."""
+    return np.broadcast_shapes(*(np.shape(element) for element in elements))
 
 
-def _is(number: Any, constant: float) -> bool:
-    return _is_constant(number) and number.dtype != bool and number == constant
+def _is(element: Any, constant: float) -> bool:
+    return _is_constant(element) and element.dtype != bool and element == constant
 
 
 def _add(a: Any, b: Any) -> Any:
@@ -289,30 +292,31 @@ def _divide(a: Any, b: Any) -> Any:
     return a if _is(a, 0) or _is(b, 1) else a / b
 
 
-SHORTENED = {"add": _add, "add_any": _add, "sub": _subtract, "mul": _multiply, "div": _divide}
+# Operations that need no computation if an operand is the constant 0 or 1.
+SIMPLIFIED = {"add": _add, "add_any": _add, "sub": _subtract, "mul": _multiply, "div": _divide}
 
 
-def _compute(equation: Any, numbers: list[Any]) -> Any:
-    """One number of an elementwise operation."""
+def _compute(equation: Any, operands: list[Any]) -> Any:
+    """One element of the result of an elementwise operation; a constant if all `operands` are."""
     name = equation.primitive.name
-    if all(map(_is_constant, numbers)):
+    if all(map(_is_constant, operands)):
         with jax.ensure_compile_time_eval():
-            return np.asarray(equation.primitive.bind(*map(jnp.asarray, numbers), **equation.params))[()]
-    if name in SHORTENED:
-        return SHORTENED[name](*numbers)
-    if name == "select_n" and _is_constant(numbers[0]):
-        return numbers[1 + int(numbers[0])]
-    batch = _batch(numbers)
-    return equation.primitive.bind(*(jnp.broadcast_to(number, batch) for number in numbers), **equation.params)
+            return np.asarray(equation.primitive.bind(*map(jnp.asarray, operands), **equation.params))[()]
+    if name in SIMPLIFIED:
+        return SIMPLIFIED[name](*operands)
+    if name == "select_n" and _is_constant(operands[0]):
+        return operands[1 + int(operands[0])]
+    batch = _batch(operands)
+    return equation.primitive.bind(*(jnp.broadcast_to(operand, batch) for operand in operands), **equation.params)
 
 
 def _reduce(combine: Callable[[Any, Any], Any], parts: Parts, axes: Sequence[int]) -> Parts:
     kept = [axis for axis in range(parts.ndim) if axis not in axes]
     shape = [parts.shape[axis] for axis in kept]
-    lined = parts.transpose([*kept, *axes]).reshape([*shape, -1])
+    rows = parts.transpose([*kept, *axes]).reshape([*shape, -1])
     result = np.empty(shape, object)
     for index in np.ndindex(*shape):
-        total, *others = lined[index]
+        total, *others = rows[index]
         for other in others:
             total = combine(total, other)
         result[index] = total
@@ -321,8 +325,8 @@ def _reduce(combine: Callable[[Any, Any], Any], parts: Parts, axes: Sequence[int
 
 def _broadcast(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Parts:
     dimensions = parameters["broadcast_dimensions"]
-    lined = [parts[0].shape[dimensions.index(axis)] if axis in dimensions else 1 for axis in range(len(shape))]
-    return np.broadcast_to(parts[0].reshape(lined), shape)
+    expanded = [parts[0].shape[dimensions.index(axis)] if axis in dimensions else 1 for axis in range(len(shape))]
+    return np.broadcast_to(parts[0].reshape(expanded), shape)
 
 
 def _slice(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Parts:
@@ -335,13 +339,14 @@ def _product(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Par
     """Sums of products over the contracted axes; `shape` is (batch, left, right)."""
     (left_sum, right_sum), (left_batch, right_batch) = parameters["dimension_numbers"]
 
-    def lined(part: Parts, batch: Sequence[int], summed: Sequence[int]) -> Parts:
+    def arranged(part: Parts, batch: Sequence[int], summed: Sequence[int]) -> Parts:
         kept = [axis for axis in range(part.ndim) if axis not in (*batch, *summed)]
         ordered = part.transpose([*batch, *kept, *summed])
         count = len(batch) + len(kept)
         return ordered.reshape([*ordered.shape[:count], -1]), ordered.shape[len(batch) : count]
 
-    (left, rows), (right, columns) = lined(parts[0], left_batch, left_sum), lined(parts[1], right_batch, right_sum)
+    left, rows = arranged(parts[0], left_batch, left_sum)
+    right, columns = arranged(parts[1], right_batch, right_sum)
     result = np.empty(shape, object)
     batches = shape[: len(left_batch)]
     for batch in np.ndindex(*batches):

@@ -1,4 +1,4 @@
-"""Drones and load as a picture, rendered by MuJoCo. `MUJOCO_GL` (egl, osmesa, glfw) chooses the GL library."""
+"""Images of drones and load, rendered by MuJoCo. `MUJOCO_GL` (egl, osmesa, glfw) selects the GL library."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ AZIMUTH, ELEVATION = 112.0, -24.0  # of the camera [degrees]
 
 
 class Scene:
-    """A plant and its goal, seen by a camera that stands still."""
+    """Renderer of a plant and its goal with a fixed camera."""
 
     def __init__(self, plant: Plant, goal: Array, size: tuple[int, int], look_at: Array, distance: float = 2.3):
         """`goal` of O (3,) [m], `size` = (height, width) in pixels; camera `distance` [m] from `look_at` (3,)."""
-        spec = build_spec(dataclasses.replace(plant, stand="free"))  # a stand's pose is one of free flight
+        spec = build_spec(dataclasses.replace(plant, stand="free"))  # poses on a stand are given as in free flight
         _light(spec, plant)
         ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.03, 0, 0], "rgba": GOAL_COLOUR}
         spec.worldbody.add_geom(name="goal", pos=list(map(float, goal)), contype=0, conaffinity=0, **ball)
         spec.visual.global_.offwidth, spec.visual.global_.offheight = max(640, size[1]), max(480, size[0])
-        # Without a GPU MuJoCo's shadows of 4096 pixels take two thirds of a picture's time, its 28 slices a quarter.
+        # Without a GPU, MuJoCo's default shadows (4096 pixels) take two thirds of the time, its 28 slices a quarter.
         spec.visual.quality.shadowsize = 1024
         spec.visual.quality.numslices, spec.visual.quality.numstacks = 12, 8
         self._model = spec.compile()
@@ -49,9 +49,9 @@ class Scene:
         self._camera.lookat[:] = look_at
 
     def picture(self, position: Array, quaternion: Array, cg_offset: Array | float, path: Array = ()) -> np.ndarray:
-        """Pixels (height, width, 3) uint8 with O at `position` (3,) [m], attitude (w, x, y, z), CG offset [m].
+        """Image (height, width, 3) uint8 with O at `position` (3,) [m], attitude (w, x, y, z), CG offset [m].
 
-        `cg_offset` has two numbers in a plane. `path` (n, 3) [m] is drawn as a line behind the object.
+        `cg_offset` is (2,) if the load moves in a plane. `path` (n, 3) [m] is drawn as a line.
         """
         data = self._data
         data.qpos[:3], data.qpos[3:7] = position, quaternion
@@ -77,27 +77,27 @@ class Scene:
 
 
 def _light(spec: mujoco.MjSpec, plant: Plant) -> None:
-    """A bright sky, a light floor and a soft headlight beside the model's own lamp."""
+    """Set a bright sky, a light floor and a soft headlight in addition to the model's light."""
     sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
     sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.80, 0.88, 0.96], [0.97, 0.98, 0.99]
     grid = spec.texture("grid")
     grid.rgb1, grid.rgb2 = [0.60, 0.64, 0.68], [0.66, 0.70, 0.74]
-    spec.geom("floor").size = [0, 0, 0.1]  # without end
+    spec.geom("floor").size = [0, 0, 0.1]  # infinite
     spec.geom("shell").rgba = [0.80, 0.68, 0.42, 0.30]
     ball, thick = spec.geom("cg"), plant.object_size[2] / 2
-    ball.rgba, ball.size = [0.98, 0.72, 0.05, 1.0], [1.4 * thick, 0, 0]  # seen from outside the object
+    ball.rgba, ball.size = [0.98, 0.72, 0.05, 1.0], [1.4 * thick, 0, 0]  # large enough to show outside the object
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
     spec.visual.map.haze = 0.0
 
 
 def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
-    """MuJoCo's, or InputError with the variable that chooses another GL library."""
+    """MuJoCo's renderer. Raises InputError, which recommends another GL library, if it does not work."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # GLFW says in other words what the sentence below does
+            warnings.simplefilter("ignore")  # GLFW's warning repeats the error below
             return mujoco.Renderer(model, *size)
-    except Exception as error:  # of every GL library another one
+    except Exception as error:  # each GL library raises another class
         chosen = os.environ.get("MUJOCO_GL")
         now = (
             f"MUJOCO_GL={chosen} does not work here"

@@ -1,6 +1,6 @@
-"""What is shown at a terminal, by rich: a status that is redrawn in place, and tables. Elsewhere plain lines.
+"""Output at a terminal by rich: a status that is redrawn in place, and tables. Without a terminal plain lines.
 
-rich costs 40 ms to import; whoever has imported flax has paid for it.
+rich takes 40 ms to import, but flax imports it anyway.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from typing import Any, TextIO
 
 PERIOD = 0.5  # [s] between two redraws
 GAP = "  "  # between the parts of a line
-LONGEST = 900  # characters of a sentence about a mistake
-Lines = Sequence[Sequence[str]]  # each of parts, the most important first
+LONGEST = 900  # characters of an error message
+Lines = Sequence[Sequence[str]]  # lines, each a list of parts, the most important part first
 
 
 def is_live(stream: TextIO) -> bool:
-    """Whether `stream` is a terminal that can go back on a line."""
+    """Whether `stream` is a terminal that can redraw a line."""
     return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
 
 
 def columns_of(stream: TextIO) -> int:
-    """Width of the terminal `stream`, whose window may have changed; 80 if it does not say."""
+    """Current width of the terminal `stream` [columns]; 80 if unknown."""
     try:
         return os.get_terminal_size(stream.fileno()).columns or 80
     except (OSError, ValueError):
@@ -34,7 +34,7 @@ def columns_of(stream: TextIO) -> int:
 
 
 def fitted(parts: Sequence[str], columns: int) -> str:
-    """As many of `parts` from the first on as a line of `columns` holds; of a first one too long its beginning."""
+    """The first of `parts` that fit into a line of `columns`, joined; the first part is cut if it is too long."""
     line = parts[0][:columns] if parts else ""
     for part in parts[1:]:
         if len(line) + len(GAP) + len(part) > columns:
@@ -44,59 +44,56 @@ def fitted(parts: Sequence[str], columns: int) -> str:
 
 
 def folded(text: str, columns: int) -> str:
-    """`text` in lines of up to `columns`, which break between words; where two blanks part what fits, there alone."""
+    """`text` wrapped to `columns` between words, or only at double blanks if the parts between these fit."""
     parts = re.split(r"  +", text.strip())
     if len(parts) > 1 and max(map(len, parts)) <= columns:
         text = re.sub(r"(?<=\S) (?=\S)", "\xa0", text)
     return textwrap.fill(text, columns, break_on_hyphens=False).replace("\xa0", " ")
 
 
-TURNS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # of the direction of what follows
+BIDI_CONTROLS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # change the direction of text
 
 
 def fitted_to(stream: TextIO | None, text: str) -> str:
-    """`text` for `stream`, blanks for what steers a terminal or turns a line, `folded` if that is a terminal.
-
-    Of a stream that is closed the program has None.
-    """
+    """`text` with control characters replaced by blanks, `folded` if `stream` is a terminal. None: a closed stream."""
     text = "".join(letter if _prints(letter) else " " for letter in text)
     return folded(text, columns_of(stream)) if stream and stream.isatty() else text
 
 
 def _prints(letter: str) -> bool:
-    """Letters, blanks, joiners and the end of a line do; controls, line separators and turns of direction do not."""
+    """Whether `letter` is printable, a blank, a joiner or a newline, and no control of terminal or text direction."""
     if letter.isprintable() or letter == "\n":
         return True
-    return unicodedata.category(letter) in ("Cf", "Zs") and unicodedata.bidirectional(letter) not in TURNS
+    return unicodedata.category(letter) in ("Cf", "Zs") and unicodedata.bidirectional(letter) not in BIDI_CONTROLS
 
 
 def say(text: str) -> None:
-    """Print a sentence on stdout, now; at a terminal it breaks between words."""
+    """Print a sentence on stdout and flush; at a terminal it is wrapped between words."""
     _print(text, sys.stdout)
 
 
 def warn(text: str) -> None:
-    """The same on stderr."""
+    """`say` on stderr."""
     _print(text, sys.stderr)
 
 
 def _print(text: str, stream: TextIO | None) -> None:
-    """Text and its end in one piece: `print` writes two, between which another thread's may come."""
+    """Write text and newline in one call: `print` makes two, between which another thread may write."""
     if stream:
         stream.write(f"{fitted_to(stream, text)}\n")
         stream.flush()
 
 
 def sentence(text: str) -> str:
-    """`text` about a mistake in one line that a person can read."""
+    """An error message `text` as one line of at most `LONGEST` characters."""
     line = " ".join(text.splitlines())
     return line if len(line) <= LONGEST else f"{line[:LONGEST]} ..."
 
 
 class Status:
-    """Lines at the bottom of a terminal, redrawn in place and cut to its width, with lines of their own above them.
+    """Lines at the bottom of a terminal, redrawn in place and cut to its width, with permanent lines above them.
 
-    Without a terminal, or in one that cannot go back on a line, there are only those of their own.
+    Without a terminal, or in one that cannot redraw a line, only the permanent lines are printed.
     """
 
     def __init__(self, stream: TextIO | None = None):
@@ -106,7 +103,7 @@ class Status:
         self._display: Any = None
 
     def show(self, lines: Callable[[], Lines]) -> None:
-        """Show from now on what `lines` returns, which is asked again every `PERIOD`."""
+        """Show the result of `lines`, which is called again every `PERIOD`."""
         self._shown = lines
         if not self.live:
             return
@@ -116,11 +113,11 @@ class Status:
         self._display.refresh()
 
     def say(self, text: str) -> None:
-        """Print `text` on lines of its own; at a terminal they break between words."""
+        """Print `text` permanently; at a terminal it is wrapped between words."""
         self._print(fitted_to(self._stream, text))
 
     def row(self, parts: Sequence[str]) -> None:
-        """Print `parts` on a line of their own; at a terminal as many as it holds."""
+        """Print `parts` permanently on one line; at a terminal as many as fit."""
         self._print(fitted(parts, columns_of(self._stream)) if self._stream.isatty() else GAP.join(parts))
 
     def _print(self, text: str) -> None:
@@ -130,7 +127,7 @@ class Status:
             self._display.console.print(text)
 
     def close(self) -> None:
-        """Take the lines away."""
+        """Remove the status."""
         if self._display is not None:
             self._display.stop()
         self._display, self.live = None, False
@@ -148,10 +145,10 @@ def _display(stream: TextIO, render: Callable[[], Any]) -> Any:
 
     class Plain(Console):
         def show_cursor(self, show: bool = True) -> bool:
-            """The cursor stays: a process that is killed could not bring it back."""
+            """Keep the cursor: a process that is killed could not restore it."""
             return False
 
-    # The window says its width, not a variable that a shell exported before it was resized.
+    # rich must ask the window for its width, not variables that a shell exported before a resize.
     known = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
     console = Plain(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False, _environ=known)
     return Live(
@@ -164,23 +161,23 @@ def _display(stream: TextIO, render: Callable[[], Any]) -> Any:
     )
 
 
-COMFORTABLE = 16  # width below which words are not folded
-INDENT = "  "  # of rows below what they have in common
+COMFORTABLE = 16  # width below which columns of words are not wrapped
+INDENT = "  "  # of rows below a line with their common cells
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[int], name: int) -> str:
-    """A table of `rows` below `heads`, in which a line break parts a name from its unit. Columns `words` hold words.
+    """A table of `rows` below `heads`, in which a newline separates name and unit. Columns `words` hold words.
 
-    Column `name` says what a row is of; what stands before it many rows have in common. On a terminal that is too
-    narrow words are folded; else what is common, or also the name and words behind it, is a line above its rows,
-    whichever shows more. What does not fit then is left out from the right, and a line says what. Elsewhere a row is
-    a line.
+    Column `name` identifies a row; columns before it are often equal in consecutive rows. On a narrow terminal columns
+    of words are wrapped. If that is not enough, the columns before `name`, or also `name` and the words after it, move
+    to a line above their rows, whichever shows more columns. Columns that still do not fit are left out from the right
+    and listed in a last line. Without a terminal nothing is wrapped.
     """
     width = columns_of(sys.stdout) if sys.stdout and sys.stdout.isatty() else 10_000
     cells = list(zip(heads, *rows, strict=True))
     shown = {0: _fitting(cells, words, width)}
-    begins = (name, *(n + 1 for n in words if n >= name))
-    shown |= {n: n + _fitting(cells[n:], (), width - len(INDENT)) for n in begins}
+    starts = (name, *(n + 1 for n in words if n >= name))
+    shown |= {n: n + _fitting(cells[n:], (), width - len(INDENT)) for n in starts}
     above = max(shown, key=lambda n: shown[n])
     end = shown[above]
     lines = _rendered(cells[above:end], [number - above for number in words], width)
@@ -194,19 +191,19 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[i
 
 
 def _below(common: Sequence[str], lines: Sequence[str], width: int) -> list[str]:
-    """The `lines` of a table, each row below what it and the rows before it have in common."""
-    top, said = len(lines) - len(common), ""
-    found = [INDENT + line for line in lines[:top]]
+    """The `lines` of a table, indented, with the text in `common` above each group of rows that share it."""
+    top, previous = len(lines) - len(common), ""
+    result = [INDENT + line for line in lines[:top]]
     for text, line in zip(common, lines[top:], strict=True):
-        if text != said:
-            found += folded(text, width).splitlines()
-        found.append(INDENT + line)
-        said = text
-    return found
+        if text != previous:
+            result += folded(text, width).splitlines()
+        result.append(INDENT + line)
+        previous = text
+    return result
 
 
 def _fitting(cells: Sequence[Sequence[str]], words: Sequence[int], width: int) -> int:
-    """How many of the columns `cells` fit, one at least, where those of `words` are folded."""
+    """Number of the columns `cells` that fit into `width`, at least one, if columns `words` are wrapped."""
     total, fitting = -2, 0
     for number, column in enumerate(cells):
         whole = max(len(line) for cell in column for line in cell.split("\n"))
@@ -217,24 +214,24 @@ def _fitting(cells: Sequence[Sequence[str]], words: Sequence[int], width: int) -
 
 
 def _named(head: str, cell: str, word: bool) -> str:
-    """A cell where no head stands above it."""
+    """A cell with its name and unit, for a line without heads; a `word` alone."""
     name, _, unit = head.partition("\n")
     return cell if word else f"{name} {cell} {unit}".strip()
 
 
 def _rendered(cells: Sequence[Sequence[str]], words: Sequence[int], width: int) -> list[str]:
-    """Lines of the columns `cells`, each with its head."""
+    """Lines of a table with the columns `cells`, whose first cells are the heads."""
     from rich.console import Console
     from rich.table import Table
 
-    made = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    grid = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for number, (head, *_) in enumerate(cells):
         word = number in words
-        made.add_column(_text(head), justify="left" if word else "right", no_wrap=not word, vertical="bottom")
+        grid.add_column(_text(head), justify="left" if word else "right", no_wrap=not word, vertical="bottom")
     for row in list(zip(*cells, strict=True))[1:]:
-        made.add_row(*map(_text, row))
+        grid.add_row(*map(_text, row))
     console = Console(file=io.StringIO(), width=width, color_system=None, highlight=False)
-    console.print(made)
+    console.print(grid)
     return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 

@@ -1,4 +1,4 @@
-"""What XLA is told before JAX finds its devices, where it keeps what it compiles, and what its errors mean to users."""
+"""XLA: flags set before JAX initialises its devices, the compilation cache, and errors explained to users."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from mjxball.errors import InputError
 from mjxball.files import user_cache
 from mjxball.terminal import warn
 
-# On CPUs a loop whose body touches fewer bytes than that becomes one function of LLVM's, instead of one for each
-# operation of its body, called by XLA's runtime, which takes longer than the operation if that has dozens of numbers.
+# On CPUs a loop whose body touches fewer bytes than this compiles to one LLVM function. Otherwise XLA's runtime calls a
+# function per operation, which takes longer than the operation itself on arrays of dozens of elements.
 SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
 
 
 def compile_small_loops_whole() -> None:
-    """Add `SMALL_LOOPS` to this process's flags, unless these say something of such options themselves."""
+    """Add `SMALL_LOOPS` to XLA_FLAGS of this process, unless they already set extra backend options."""
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()
 
 
 def explained(error: BaseException) -> str | None:
-    """What a user can do about an `error` of JAX's, a sentence; None if it is nothing of the kind.
+    """A sentence on what the user can do about an `error` of JAX; None for other errors.
 
-    Without a device of `JAX_PLATFORMS` JAX fails in many ways, one of them an assertion without a word.
+    Without a device of `JAX_PLATFORMS`, JAX fails in many ways, for example with an assertion without a message.
     """
     jax: Any = sys.modules.get("jax")
     if isinstance(error, MemoryError):
@@ -48,7 +48,7 @@ ADDRESS_SPACE = 2.5e9  # [B] that JAX, its compiler and their threads reserve; w
 
 
 def check_address_space() -> None:
-    """Refuse to start JAX below a limit in which it would hang or abort without a word. Raises InputError."""
+    """Raise InputError if `ulimit -v` is so low that JAX would hang or abort without a message."""
     limit, needed = resource.getrlimit(resource.RLIMIT_AS)[0], ADDRESS_SPACE / 1e9
     if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
         raise InputError(
@@ -58,7 +58,7 @@ def check_address_space() -> None:
 
 
 def room_in_address_space() -> float:
-    """What this process may still reserve [B]."""
+    """Address space that this process may still reserve [B]."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY:
         return float("inf")
@@ -70,45 +70,44 @@ VARIABLE = "MJXBALL_CACHE"
 
 
 def cache_directory() -> Path | None:
-    """Where compiled programs are kept: $MJXBALL_CACHE, else in `user_cache`; None if it is `off` or there is none."""
-    chosen = os.environ.get(VARIABLE)
-    if chosen is not None:
-        return None if chosen.lower() in ("", "off", "0") else Path(chosen)
-    place = user_cache()
-    return place and place / "jax"
+    """Directory of compiled programs: $MJXBALL_CACHE, else in `user_cache`; None if that is `off` or does not exist."""
+    setting = os.environ.get(VARIABLE)
+    if setting is not None:
+        return None if setting.lower() in ("", "off", "0") else Path(setting)
+    parent = user_cache()
+    return parent and parent / "jax"
 
 
 def traced_directory() -> Path | None:
-    """Where traced programs are kept: in the compilation cache's directory; None if there is no such cache."""
-    place = _directory_of_jax()
-    return Path(place) / "traced" if place and "://" not in place else None
+    """Directory of traced programs, inside that of the compilation cache; None without a local one."""
+    directory = _directory_of_jax()
+    return Path(directory) / "traced" if directory and "://" not in directory else None
 
 
 def _directory_of_jax() -> str | None:
     import jax
 
-    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
+    settings: Any = jax.config  # its attributes are created at import, so type checkers do not know them
     return settings.jax_compilation_cache_dir
 
 
 def enable_compilation_cache() -> Path | None:
-    """Turn the cache on, unless JAX was told of one or it is switched off; return its directory if it is ours."""
+    """Enable JAX's compilation cache in `cache_directory()`; return that, or None if unused or JAX has one already."""
     check_address_space()
     import jax
 
-    place = cache_directory()
-    if place is None or _directory_of_jax():
+    directory = cache_directory()
+    if directory is None or _directory_of_jax():
         return None
     try:
-        place.mkdir(parents=True, exist_ok=True)
-        usable = os.access(place, os.R_OK | os.W_OK | os.X_OK)
+        directory.mkdir(parents=True, exist_ok=True)
+        usable = os.access(directory, os.R_OK | os.W_OK | os.X_OK)
     except OSError:
         usable = False
     if not usable:
-        text = f"warning: {place} cannot be written: nothing compiled is kept; set {VARIABLE} to another directory"
-        warn(text)
+        warn(f"warning: {directory} cannot be written: nothing compiled is kept; set {VARIABLE} to another directory")
         return None
-    jax.config.update("jax_compilation_cache_dir", str(place))
+    jax.config.update("jax_compilation_cache_dir", str(directory))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-    return place
+    return directory

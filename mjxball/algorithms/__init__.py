@@ -1,6 +1,6 @@
-"""Learning algorithms: one class in one file each. `mjxball.algorithms.base` says what the trainer asks of it."""
+"""Learning algorithms, one class per file. `mjxball.algorithms.base` defines the interface to the trainer."""
 
-# Names that `train.py --algorithm` takes beside package.module:Class; each has the section of settings of its name.
+# Names that `train.py --algorithm` accepts besides package.module:Class. Each has a section of settings of that name.
 ALGORITHMS = {
     "sac": "mjxball.algorithms.sac:SoftActorCritic",
     "ppo": "mjxball.algorithms.ppo:ProximalPolicyOptimization",

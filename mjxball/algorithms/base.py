@@ -1,4 +1,4 @@
-"""What the trainer asks of a learning algorithm, and what it gives it. Nothing in `train/` knows which one runs."""
+"""Interface between the trainer and a learning algorithm. Nothing in `train/` depends on which algorithm runs."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ if TYPE_CHECKING:
 
 
 class Phase(NamedTuple):
-    """What the environments are stepped for. Traced, so that one compiled program serves all phases."""
+    """Purpose of a block of environment steps. The fields are traced, so one compiled program serves all phases."""
 
-    random: Bool[Array | np.ndarray, ""]  # act uniformly at random and record, before anything is learnt
+    random: Bool[Array | np.ndarray, ""]  # act uniformly at random and record, before learning starts
     evaluate: Bool[Array | np.ndarray, ""]  # act with the policy's mean; nothing is recorded or learnt
 
     @property
     def recording(self) -> Bool[Array | np.ndarray, ""]:
-        """Whether what happens is remembered."""
+        """Whether transitions are stored."""
         return ~self.evaluate
 
     @property
     def learning(self) -> Bool[Array | np.ndarray, ""]:
-        """Whether the algorithm updates what it has learnt."""
+        """Whether the algorithm updates its parameters."""
         return ~(self.random | self.evaluate)
 
 
 class Schedule(NamedTuple):
-    """How the trainer runs an algorithm. Counted in environment steps, of all environments together."""
+    """Length of a training run. Steps are counted over all environments together."""
 
     total_steps: int
     num_envs: int
@@ -44,20 +44,20 @@ class Schedule(NamedTuple):
 
 
 class PolicyNetwork(NamedTuple):
-    """What is exported: a tanh-squashed network on normalised observations (`Network`). A pytree of arrays.
+    """Exported policy: a tanh-squashed network on normalised observations (`Network`). A pytree of arrays.
 
-    With a GRU an observation holds its state behind the network's inputs, and an answer the next state behind the
-    action.
+    With a GRU, its state follows the network's inputs in an observation, and its next state follows the action in the
+    output.
     """
 
     layers: Any  # Flax's {"hidden_0": {"kernel", "bias"}, ...}; the last gives mean and deviation of the action
-    # and perhaps a GRU below them, "gru": {"kernel", "recurrent", "bias"}
+    # With a GRU in front of them also "gru": {"kernel", "recurrent", "bias"}.
     mean: Float[Array, " n"]  # of the observations
     deviation: Float[Array, " n"]
-    mask: Float[Array, " n"]  # 0 for a slot that the policy does not use, else 1
+    mask: Float[Array, " n"]  # 1 for entries that the policy uses, else 0
 
     def __call__(self, observation: Float[Array, "... n"]) -> Float[Array, "... answer"]:
-        """Mean action in [-1, 1] at `observation`, and the next state of a GRU."""
+        """Mean action in [-1, 1] at `observation`, followed by the next state of a GRU."""
         return self.network()(observation[..., : self.inputs + self.units])
 
     def outputs(self, observation: Float[Array, "... n"]) -> tuple[Array, Array]:
@@ -67,37 +67,37 @@ class PolicyNetwork(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """Of the network, a GRU's state not counted."""
+        """Number of the network's inputs, without a GRU's state."""
         return self.layers["gru"]["kernel"].shape[-2] if "gru" in self.layers else self.mean.shape[-1]
 
     @property
     def units(self) -> int:
-        """Of the GRU, 0 without one."""
+        """Number of units of the GRU, 0 without one."""
         return self.layers["gru"]["recurrent"].shape[-2] if "gru" in self.layers else 0
 
     def network(self, deviations: bool = False) -> Network:
-        """As a policy file has it, without the `deviations` of the action."""
+        """The network as a policy file stores it. With `deviations` it also outputs the action's deviations."""
         names = sorted(self.layers.keys() - {"gru"}, key=lambda name: int(name.rsplit("_", 1)[1]))
         weights, biases = ([self.layers[name][part] for name in names] for part in ("kernel", "bias"))
-        columns, own, gru = weights[-1].shape[-1], slice(self.inputs), self.layers.get("gru")
-        told = slice(columns if deviations else columns // 2)
+        columns, inputs, gru = weights[-1].shape[-1], slice(self.inputs), self.layers.get("gru")
+        outputs = slice(columns if deviations else columns // 2)
         return Network(
-            weights=(*weights[:-1], weights[-1][..., told]),
-            biases=(*biases[:-1], biases[-1][..., told]),
-            mean=self.mean[..., own],
-            scale=(self.mask[..., own] / self.deviation[..., own]),
+            weights=(*weights[:-1], weights[-1][..., outputs]),
+            biases=(*biases[:-1], biases[-1][..., outputs]),
+            mean=self.mean[..., inputs],
+            scale=(self.mask[..., inputs] / self.deviation[..., inputs]),
             gru=None if gru is None else (gru["kernel"], gru["recurrent"], gru["bias"]),
         )
 
 
 class Shards(NamedTuple):
-    """One learner's environments, memory and batches cut into `parts` equal parts along a mapped axis."""
+    """Division of one learner's environments, replay and batches into `parts` equal parts along a mapped axis."""
 
     axis: str | None = None
     parts: int = 1
 
     def own(self, key: Array) -> Array:
-        """A key of this shard alone, from one that all shards share."""
+        """A key unique to this shard, derived from a `key` that all shards share."""
         return jax.random.fold_in(key, jax.lax.axis_index(self.axis)) if self.axis else key
 
     def mean(self, value: Any) -> Any:
@@ -110,47 +110,48 @@ class Shards(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One step of all environments of a shard, before any of them starts anew."""
+    """One step of all environments of a shard, before any reset."""
 
     observation: Float[Array, "envs n"]
     action: Float[Array, "envs actions"]  # in [-1, 1]
     reward: Float[Array, " envs"]
-    terminated: Float[Array, " envs"]  # 1. if the episode ended other than by the time limit
+    terminated: Float[Array, " envs"]  # 1. if the episode ended for another reason than the time limit
     next_observation: Float[Array, "envs n"]
     done: Float[Array, " envs"]  # 1. if the episode ended
 
 
 class Environments(Protocol):
-    """Environments side by side, as an algorithm sees them (`mjxball.train.program`)."""
+    """Batch of environments as an algorithm sees it, implemented in `mjxball.train.program`."""
 
     count: int  # of this shard
     observation_size: int
     action_size: int  # with the next state of a recurrent policy
-    recurrent_slots: slice  # of an observation: the state of a recurrent policy; empty if it has none
-    policy_mask: Any  # (n,) 1 for what the policy may use of an observation, else 0
-    critic_mask: Any  # (n,) the same for what is needed in training only
-    turn: Any  # (count,) in which of several turns, again and again, each is to start anew where all do so in turn
+    recurrent_slots: slice  # entries of an observation that hold a recurrent policy's state; empty without one
+    policy_mask: Any  # (n,) 1 for entries of an observation that the policy may use, else 0
+    critic_mask: Any  # (n,) 1 for entries that critics may use, else 0
+    turn: Any  # (count,) integer offset of each environment, to stagger the starts of episodes
     shards: Shards
-    smooth: bool  # whether all of a step has a gradient backwards, also what no action has a part in
+    smooth: bool  # whether all outputs of a step have a reverse-mode gradient, also those independent of the action
 
     def restart(self, envs: Any, key: Array, others: Bool[Array, " envs"] | None = None) -> Any:
-        """Those of `envs` whose episode ended start anew, at states drawn with `key`, and so do `others`."""
+        """Reset those of `envs` whose episode ended, and `others`, to initial states sampled with `key`."""
         ...
 
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
-        """The same environments, which `transform` of the step of a single one steps, such as `jax.vmap`."""
+        """The same environments, with the step of a single one batched by `transform`, such as `jax.vmap`."""
         ...
 
     def drawn(self, envs: Any, key: Array) -> Any:
-        """States to start anew from, one for each of `envs`, for `step`."""
+        """Sampled initial states, one for each of `envs`, to pass to `step`."""
         ...
 
     def step(
         self, envs: Any, action: Float[Array, "envs actions"], key: Array | None, fresh: Any = None
     ) -> tuple[Any, Transition]:
-        """Step `envs` with `action`, then `restart` them; with a `key` of None those that ended go on.
+        """Step `envs` with `action`, then reset those whose episode ended.
 
-        Those that ended begin at `fresh` if it is given, which spares a draw at every step.
+        Initial states are sampled with `key`, or taken from `fresh` (of `drawn`), which avoids sampling at every step.
+        With neither, ended episodes go on.
         """
         ...
 
@@ -158,33 +159,34 @@ class Environments(Protocol):
 class Algorithm(Protocol):
     """A learning algorithm. All its functions are pure, and can be jitted and vmapped.
 
-    One that is done on a CPU before it could be compiled well, or at all for a GPU, may say so: `prefers_cpu = True`.
-    One whose products of matrices are large enough for a GPU's cuBLAS: `large_products = True`.
+    Optional attributes: `prefers_cpu = True` if training on a CPU ends before a GPU program would be compiled, or no
+    GPU program can be; `large_products = True` if its matrix products are large enough for a GPU's cuBLAS.
     """
 
     schedule: Schedule
-    metrics: tuple[str, ...]  # names of what `update` reports
+    metrics: tuple[str, ...]  # names of the values that `update` reports
     engines: tuple[str, ...]  # physics engines that it works with, the default first
-    collect_keys: int  # random keys that `collect` takes
-    update_keys: int  # and that `update` takes
+    collect_keys: int  # number of random keys that `collect` takes
+    update_keys: int  # number of random keys that `update` takes
     steps_per_collect: int  # steps of every environment in one `collect`
 
     def __init__(self, config: Config, environments: Environments): ...
 
     def init(self, key: Array) -> Any:
-        """What is known at the start: any pytree of arrays without empty ones."""
+        """Initial state: any pytree of arrays, none of them empty."""
         ...
 
     def collect(self, state: Any, envs: Any, keys: Any, phase: Phase) -> tuple[Any, Any]:
-        """Step the environments and remember what is to be learnt from: (state, envs)."""
+        """Step the environments and store in the state what `update` learns from: (state, envs)."""
         ...
 
     def update(
         self, state: Any, keys: Any, progress: Float[Array, ""], phase: Phase
     ) -> tuple[Any, dict[str, Float[Array, ""]]]:
-        """Learn, if `phase.learning`: (state, `metrics`). `progress` is the share of training done, 0 to 1.
+        """Learn if `phase.learning`: (state, values of `metrics`). `progress` is the share of training done, 0 to 1.
 
-        `train.py` calls it then alone; in a whole program (`mjxball.train.train`) it must leave `state` as it is else.
+        `train.py` calls it in that phase only. `mjxball.train.train` calls it in every phase, so it must return `state`
+        unchanged in the others.
         """
         ...
 
@@ -193,9 +195,9 @@ class Algorithm(Protocol):
         ...
 
     def partition(self, whole: Any, split: Any) -> Any:
-        """What `init` returns (or parts of it) with `split` for arrays cut by environments, `whole` for the others."""
+        """A prefix of `init`'s pytree: `split` for arrays that are cut by environments, `whole` for the others."""
         ...
 
     def check_parts(self, parts: int) -> None:
-        """Raise InputError unless the work can be cut into `parts`."""
+        """Raise InputError unless the work can be cut into `parts` equal parts."""
         ...

@@ -1,4 +1,4 @@
-"""First-order gradients of the return through a differentiable environment, window by window of its episodes."""
+"""First-order gradients of the return through a differentiable environment, over one window of an episode at a time."""
 
 from __future__ import annotations
 
@@ -19,89 +19,91 @@ from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 from mjxball.scalar_form import scalar_form
 
-SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
+SMALL_RESPONSE = 1e-3  # response to a unit impulse, in deviations of observations and in actions, that is negligible
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
-IMPULSE_RESPONSE_FROM = 0.75  # share of the gradient steps after which it begins to count
-LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
+IMPULSE_RESPONSE_FROM = 0.75  # share of the gradient steps after which the impulse response counts
+LEAST_DEVIATION = 0.02  # of an observation, so that one which hardly moves in the first window is not amplified
 
 
 @jax.custom_batching.custom_vmap
-def _of_all(value: Array) -> Array:
-    """`value`, which is the same in every member of a population, as one number for all of them.
+def _unbatched(value: Array) -> Array:
+    """`value`, equal in all members of a population, as one unbatched scalar.
 
-    What hangs on it is then one branch, where members of their own would compute both.
+    `lax.cond` on it runs one branch. On a batched value it would compute both.
     """
     return value
 
 
-@_of_all.def_vmap
-def _of_all_members(count: int, batched: Any, value: Array) -> tuple[Array, bool]:
+@_unbatched.def_vmap
+def _unbatched_rule(count: int, batched: Any, value: Array) -> tuple[Array, bool]:
     return (value[0] if batched[0] else value), False
 
 
 class GradientState(NamedTuple):
-    """What the algorithm knows."""
+    """State of `FirstOrderGradient`."""
 
     layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`PolicyNetwork`)
     adam: Any
     slope: Any  # gradient of the last window's loss, a pytree like `layers`
     loss: Array  # () minus the mean reward of the last window
-    mean: Array  # (n,) of the observations in the first window, which nothing is learnt from
+    mean: Array  # (n,) of the observations in the first window, in which the policy does not learn
     square: Array  # (n,) mean of their squares
-    seen: Array  # () 1 once they are known
-    windows: Array  # () flown, as an integer
+    seen: Array  # () 1 once `mean` and `square` are known
+    windows: Array  # () integer number of windows flown
 
 
 class FirstOrderGradient:
     """Backpropagation through windows of `gradient.horizon` steps of all environments, then one step of Adam.
 
-    `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
-    the step. Windows follow one another in an episode of `gradient.windows_per_episode`, of several lengths if it has
-    several; the environments begin theirs in turn, so that every window has flights towards the goal and flights at
-    it. `gradient.gradient_decay` multiplies
-    the gradient that passes from one control step to the one before, and `gradient.state_gradient_clip` limits it in
-    each environment. A recurrent network's own state passes it whole: that is what it is to learn to remember by.
-    `gradient.impulse_response` asks for a closed loop that is well damped about every flight, however small its errors.
+    `collect` flies a window and differentiates its mean reward by the policy's weights; `update` takes the step. An
+    episode is `gradient.windows_per_episode` windows long; with several lengths, environments differ. Their starts are
+    staggered, so that every window contains flights towards the goal and flights at it.
+
+    `gradient.gradient_decay` multiplies the gradient that passes from one control step to the one before, and
+    `gradient.state_gradient_clip` limits it in each environment. The gradient of a recurrent network's state is neither
+    decayed nor clipped, so that the network learns to remember. `gradient.impulse_response` weights a cost of poorly
+    damped closed loops, however small the errors of the flight.
     """
 
     metrics = ("loss", "gradient_norm")
-    engines = ("newton-euler",)  # MJX iterates, and what iterates has no gradient backwards
+    engines = ("newton-euler",)  # MJX's solver iterates in a loop, which has no reverse-mode gradient
     prefers_cpu = True
     collect_keys = 1
     update_keys = 0
 
     def __init__(self, config: Config, environments: Environments):
-        own = config.gradient
-        # Number by number a window's gradient takes a quarter of the time, and two thirds to compile; but it has none
-        # forwards.
+        settings = config.gradient
+        # In scalar form a window's gradient takes a quarter of the time, and two thirds to compile. It has no
+        # forward-mode gradient, which impulse responses need.
         self._environments, self._plain = (environments.rewritten(form) for form in (scalar_form, jax.vmap))
-        self._config = own
+        self._config = settings
         self._shards = environments.shards
-        self._adam = optax.scale_by_adam(*own.adam_betas)
-        self.steps_per_collect = own.horizon
-        window = own.num_envs * own.horizon
-        self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations)
+        self._adam = optax.scale_by_adam(*settings.adam_betas)
+        self.steps_per_collect = settings.horizon
+        window = settings.num_envs * settings.horizon
+        steps = (settings.gradient_steps + 1) * window
+        self.schedule = Schedule(steps, settings.num_envs, window, settings.num_evaluations)
         self._slots = environments.recurrent_slots
         self._units = self._slots.stop - self._slots.start
         self._actions = environments.action_size - self._units
-        self._sizes = (environments.observation_size, *own.policy_layers, 2 * self._actions)
+        self._sizes = (environments.observation_size, *settings.policy_layers, 2 * self._actions)
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
-        weight: Any = own.impulse_response  # no number where a sweep traces it
+        weight: Any = settings.impulse_response  # a traced array in a sweep
         self._responds = not (isinstance(weight, (int, float)) and weight == 0)
-        self._responds_from = round(IMPULSE_RESPONSE_FROM * own.gradient_steps)  # windows
+        self._responds_from = round(IMPULSE_RESPONSE_FROM * settings.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
-        """A policy that adds hardly anything."""
-        seen = self._slots.start if self._units else self._sizes[0]
-        layers = fresh_layers(key, seen, self._units, self._sizes[1:])
-        zero, none = jnp.zeros(()), jnp.zeros(self._sizes[0])
+        """Initial state. The first policy outputs actions close to 0."""
+        inputs = self._slots.start if self._units else self._sizes[0]
+        layers = fresh_layers(key, inputs, self._units, self._sizes[1:])
+        zero, zeros = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
-        return GradientState(layers, self._adam.init(layers), slope, zero, none, none, zero, jnp.zeros((), jnp.int32))
+        return GradientState(layers, self._adam.init(layers), slope, zero, zeros, zeros, zero, jnp.zeros((), jnp.int32))
 
     def start_from(self, state: GradientState, policy: PolicyFile) -> GradientState:
-        """`state`, but with the network of `policy` and its normalisation, in NumPy.
+        """`state` with the network and normalisation of `policy`, as NumPy arrays.
 
-        What only critics see stands behind what the policy does, and keeps its rows. InputError for other layers.
+        Inputs of critics alone follow the policy's inputs; their rows stay. InputError if the layers' sizes differ.
         """
         seen, units = len(policy.observation_mean), 0 if policy.gru is None else len(policy.gru[1])
         sizes = (seen + units, *(len(bias) for bias in policy.biases))
@@ -131,26 +133,26 @@ class FirstOrderGradient:
         return state._replace(layers=layers, mean=means, square=squares, seen=np.ones((), np.float32))
 
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
-        """One window of all environments and its gradient; the first one gives the observations' statistics."""
-        own = self._environments
-        begins = starts_anew(own.turn, state.windows, self._config.windows_per_episode)
-        envs = own.restart(envs, keys[0], begins & phase.recording)
-        # Also by the first states, where they allow it: JAX then sees at once what the loop carries a gradient of.
-        arguments = (0, 2) if own.smooth else (0,)
+        """One window of all environments and its gradient. The first window gives the observations' statistics."""
+        environments = self._environments
+        begins = starts_anew(environments.turn, state.windows, self._config.windows_per_episode)
+        envs = environments.restart(envs, keys[0], begins & phase.recording)
+        # Where possible, differentiate by the initial states too: JAX then knows which carries have a gradient.
+        arguments = (0, 2) if environments.smooth else (0,)
         differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
         flown = functools.partial(differentiated, state.layers, state, envs)
         if self._responds:
             own_key = self._shards.own(jax.random.fold_in(keys[0], 1))
             impulse = jax.random.normal(own_key, (len(envs.states.obs), self._actions))
-            late = _of_all(state.windows) >= self._responds_from
-            whole, plain = functools.partial(flown, impulse), functools.partial(flown, ())
-            found = jax.lax.cond(late, whole, plain) if self._responds_from else whole()
+            late = _unbatched(state.windows) >= self._responds_from
+            with_impulse, without = functools.partial(flown, impulse), functools.partial(flown, ())
+            found = jax.lax.cond(late, with_impulse, without) if self._responds_from else with_impulse()
             (loss, (envs, mean, square)), (slope, *_) = found
         else:
             (loss, (envs, mean, square)), (slope, *_) = flown(())
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32) * (1 - state.seen)
-        known = GradientState(
+        updated = GradientState(
             layers=state.layers,
             adam=state.adam,
             slope=slope,
@@ -160,37 +162,42 @@ class FirstOrderGradient:
             seen=jnp.maximum(state.seen, first),
             windows=state.windows + 1,
         )
-        known = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), known, state)
-        return known, envs
+        updated = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), updated, state)
+        return updated, envs
 
     def _window(self, layers: Any, state: GradientState, envs: Any, impulse: Any) -> Any:
+        """(loss, (envs, mean (n,) of the observations, mean (n,) of their squares)) after one window.
+
+        `impulse` (envs, actions) starts an impulse response, whose cost the loss then contains; () for none.
+        """
         policy = self.policy(state._replace(layers=layers))
-        respond = jax.checkpoint(functools.partial(self._respond, policy))
+        advance = jax.checkpoint(functools.partial(self._advance_response, policy))
 
         def step(carry: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
             envs, response, impulse = carry
             envs = envs._replace(states=self._damped(envs.states))
             seen, lasting = envs.states.obs, 0.0
             if response:
-                response, lasting = respond(envs, response, impulse)
+                response, lasting = advance(envs, response, impulse)
             envs, after = self._environments.step(envs, policy(seen), None)
-            impulse = jax.tree.map(jnp.zeros_like, impulse)  # over after one step
+            impulse = jax.tree.map(jnp.zeros_like, impulse)  # lasts one step
             return (_forget(envs), response, impulse), (after.reward - lasting, jax.lax.stop_gradient(seen))
 
-        answers = isinstance(impulse, jax.Array)
-        response = jax.tree.map(jnp.zeros_like, _floats(envs.states)) if answers else []
+        has_impulse = isinstance(impulse, jax.Array)
+        response = jax.tree.map(jnp.zeros_like, _floats(envs.states)) if has_impulse else []
         start: Any = envs, response, impulse
         (envs, *_), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
 
-    def _respond(
+    def _advance_response(
         self, policy: PolicyNetwork, envs: Any, response: list[Array], impulse: Array
     ) -> tuple[list[Array], Array]:
-        """(what `response` of `_floats(envs.states)` is one step on, the cost of it (envs,)).
+        """(`response` after one more step, its cost (envs,)).
 
-        The closed loop is linearised about the flight, which has no gradient here: the policy's slopes alone have one.
-        What counts are the observations, each over its deviation, and the actions, so that what followers do against
-        each other counts as well, which none of them sees.
+        `response` is a tangent of `_floats(envs.states)`: the closed loop is linearised about the flight. The flight is
+        held constant, so that the gradient reaches the policy through its derivatives only. The cost counts the
+        observations, each over its deviation, and the actions, because followers that act against each other may leave
+        all observations unchanged.
         """
         still = jax.lax.stop_gradient(envs)
         size = impulse.shape[-1]
@@ -211,35 +218,34 @@ class FirstOrderGradient:
         return response, self._config.impulse_response * jnp.log1p(square / SMALL_RESPONSE**2)
 
     def _damped(self, states: Any) -> Any:
-        """`states`; the gradient that passes them backwards is made smaller, that of a network's own state is not."""
+        """`states`, whose backward gradient decays and is clipped, except that of a recurrent network's state."""
         decay: Any = self._config.gradient_decay
         clip: Any = self._config.state_gradient_clip
-        if isinstance(clip, float) and clip == 0:  # neither is a number where a sweep traces it
+        if isinstance(clip, float) and clip == 0:  # in a sweep both are traced arrays
             damped = states if isinstance(decay, float) and decay == 1 else _decayed(states, decay)
         else:
             damped = _clipped(states, decay, clip / (self._config.horizon * self._environments.count))
         if not self._units:
             return damped
-        own, seen = self._slots, damped.obs
-        parts = [seen[..., : own.start], states.obs[..., own], seen[..., own.stop :]]
+        slots, observation = self._slots, damped.obs
+        parts = [observation[..., : slots.start], states.obs[..., slots], observation[..., slots.stop :]]
         return damped.replace(obs=jnp.concatenate(parts, axis=-1))
 
     def update(
         self, state: GradientState, keys: Sequence[Array], progress: Array, phase: Phase
     ) -> tuple[GradientState, dict[str, Array]]:
-        """One step of Adam along the window's gradient; its rate falls by a cosine."""
-        own = self._config
+        """One step of Adam along the window's gradient. The learning rate decays by a cosine."""
+        settings = self._config
         norm = optax.global_norm(state.slope)
-        # A window that diverged has no gradient.
+        # The gradient of a diverged window is not finite: no step.
         sound = jnp.isfinite(norm) & phase.learning
         slope = jax.tree.map(
             lambda one: jnp.where(sound, one * jnp.minimum(1.0, MAX_GRAD_NORM / (norm + 1e-9)), 0.0), state.slope
         )
-        fall = own.learning_rate_final_ratio + (1.0 - own.learning_rate_final_ratio) * 0.5 * (
-            1.0 + jnp.cos(jnp.pi * progress)
-        )
+        final = settings.learning_rate_final_ratio
+        fall = final + (1.0 - final) * 0.5 * (1.0 + jnp.cos(jnp.pi * progress))
         direction, adam = self._adam.update(slope, state.adam)
-        rate = own.learning_rate * fall
+        rate = settings.learning_rate * fall
         moved = state._replace(
             layers=jax.tree.map(lambda value, along: value - rate * along, state.layers, direction), adam=adam
         )
@@ -247,18 +253,18 @@ class FirstOrderGradient:
         return moved, dict(zip(self.metrics, (state.loss, norm), strict=True))
 
     def policy(self, state: GradientState) -> PolicyNetwork:
-        """The policy as it is."""
-        xp = state.mean.__array_namespace__()  # NumPy's, when a policy file is written: nothing is compiled for that
+        """The current policy."""
+        xp = state.mean.__array_namespace__()  # NumPy when a policy file is written, so that nothing is compiled
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
         return PolicyNetwork(state.layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
-        """Everything that is known is whole."""
+        """No array of the state is cut by environments."""
         return whole
 
     def check_parts(self, parts: int) -> None:
-        """Raise InputError unless the environments can be cut into `parts`."""
+        """Raise InputError unless the environments can be cut into `parts` equal parts."""
         if self._config.num_envs % parts:
             raise InputError(
                 f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
@@ -267,29 +273,29 @@ class FirstOrderGradient:
 
 
 def starts_anew(turn: Any, windows: Any, lengths: Sequence[int]) -> Any:
-    """(count,) which environments begin an episode when `windows` of it are flown.
+    """(count,) which environments begin an episode after `windows` windows of training.
 
-    `turn` (count,): their place in turn (`Environments.turn`). Neighbours have different `lengths`, and those of one
-    length begin in turn.
+    `turn` (count,): `Environments.turn`. `lengths`: possible lengths of an episode [windows]. Neighbours have different
+    lengths, and the starts of environments with the same length are staggered.
     """
-    own = jnp.asarray(lengths)[turn % len(lengths)]
-    return (turn // len(lengths) + windows) % own == 0
+    length = jnp.asarray(lengths)[turn % len(lengths)]
+    return (turn // len(lengths) + windows) % length == 0
 
 
 def _forget(envs: Any) -> Any:
-    """`envs` without the derivatives of what the next step does not start from: a scan would carry them all back."""
+    """`envs` without derivatives of the fields that the next step does not read: a scan would carry them all back."""
     still, states = jax.lax.stop_gradient, envs.states
     past = {name: still(getattr(states, name)) for name in ("reward", "done", "metrics", "info")}
     return envs._replace(states=states.replace(**past), statistics=still(envs.statistics))
 
 
 def _floats(tree: Any) -> list[Array]:
-    """The leaves of `tree` that have derivatives."""
+    """Leaves of `tree` with a floating dtype: those that have derivatives."""
     return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
 
 
 def _with_floats(tree: Any, floats: Sequence[Array]) -> Any:
-    """`tree` with these in place of them."""
+    """`tree` with its floating leaves (`_floats`) replaced by `floats`."""
     leaves, structure = jax.tree.flatten(tree)
     given = iter(floats)
     return jax.tree.unflatten(
@@ -298,7 +304,7 @@ def _with_floats(tree: Any, floats: Sequence[Array]) -> Any:
 
 
 def _decayed(tree: Any, factor: float) -> Any:
-    """`tree` as it is; a gradient that passes through its floats is multiplied by `factor`."""
+    """`tree`, unchanged; a gradient that passes back through its floating leaves is multiplied by `factor`."""
 
     def one(leaf: Array) -> Array:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -310,7 +316,7 @@ def _decayed(tree: Any, factor: float) -> Any:
 
 @jax.custom_vjp
 def _clip_backwards(leaves: list[Array], decay: Array, longest: Array) -> list[Array]:
-    """`leaves`, arrays (envs, ...); see `_clipped`."""
+    """`leaves`, arrays (envs, ...), unchanged; its gradient is `_clip`."""
     return leaves
 
 
@@ -328,10 +334,11 @@ _clip_backwards.defvjp(lambda leaves, decay, longest: (leaves, (decay, longest))
 
 
 def _clipped(tree: Any, decay: Any, longest: Any) -> Any:
-    """`tree` as it is; a gradient that passes through its floats is at most `longest` in each environment, then decays.
+    """`tree`, unchanged; a gradient back through it is clipped to `longest` in each environment, then decays.
 
-    Numbers of it that are not finite are 0. Leaves of other lengths, as those of worlds with several followers, are
-    limited apart. Without this a few environments that are about to diverge lead all others astray.
+    `longest` limits the norm over all floating leaves, `decay` multiplies the result. Entries that are not finite
+    become 0. Leaves of different lengths, as in worlds with several followers, are clipped separately. Without the
+    limit, a few environments close to divergence dominate the gradient of all.
     """
     leaves, structure = jax.tree.flatten(tree)
     floats = [k for k, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]

@@ -1,4 +1,4 @@
-"""The networks of soft actor-critic, Brax's, and the normalisation that all networks share."""
+"""Brax's networks of soft actor-critic, and the normalisation of observations that SAC and PPO share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ brax = import_brax_training()
 
 
 class Networks(NamedTuple):
-    """Brax's `SACNetworks`, perhaps with a recurrent policy, and a state-value network, None unless `state_value`."""
+    """Brax's `SACNetworks` and a state-value network (None unless `state_value`). The policy may be recurrent."""
 
     policy_network: Any
     q_network: Any
@@ -31,7 +31,7 @@ def make_networks(
 ) -> Networks:
     """Brax's SAC networks: tanh-squashed Gaussian policy and critics, ReLU, on normalised observations.
 
-    `mask` (n,) of 0 and 1 hides slots of the observation from the policy, `critic_mask` from critics and value
+    `mask` (n,) is 1 for entries of the observation that the policy uses, else 0; `critic_mask` for critics and value
     (None: the same). With `recurrent_slots` of the observation the policy is a `RecurrentPolicy`.
     """
     distribution = TanhGaussian(event_size=action_size)
@@ -59,7 +59,7 @@ def make_networks(
 
 
 def _critics(config: Sac, observation_size: int, action_size: int, normalise: Callable[[Array, Any], Array]) -> Any:
-    """Brax's critics, their parameters stacked: one product a layer for all of them, not one for each."""
+    """Brax's critics with stacked parameters: one matrix product per layer for all critics together."""
     layout: dict[str, Any] = {"activation": jax.nn.relu, "layer_norm": config.critic_layer_norm}
     separate = brax.networks.make_q_network(
         observation_size, action_size, hidden_layer_sizes=config.critic_layers, n_critics=config.num_critics, **layout
@@ -71,24 +71,24 @@ def _critics(config: Sac, observation_size: int, action_size: int, normalise: Ca
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[name] for name in sorted(parts)))
 
     def apply(statistics: Any, critics: Any, observation: Array, action: Array) -> Array:
-        """(..., critics)"""
-        seen = jnp.concatenate([normalise(observation, statistics), action], axis=-1)
-        found = jax.vmap(lambda parameters: critic.apply({"params": parameters}, seen))(critics)
-        return jnp.moveaxis(found[..., 0], 0, -1)
+        """Q values (..., critics)."""
+        inputs = jnp.concatenate([normalise(observation, statistics), action], axis=-1)
+        values = jax.vmap(lambda parameters: critic.apply({"params": parameters}, inputs))(critics)
+        return jnp.moveaxis(values[..., 0], 0, -1)
 
     return brax.networks.FeedForwardNetwork(init, apply)
 
 
 class TanhGaussian(brax.distribution.NormalTanhDistribution):  # type: ignore[name-defined]
-    """Brax's, which where it samples takes standard normal numbers of the sample's shape instead of a key."""
+    """Brax's distribution, but sampled from given standard normal noise instead of a key."""
 
     def sample_no_postprocessing(self, parameters: Array, seed: Array) -> Array:
-        """A sample before tanh."""
-        made = self.create_dist(parameters)
-        return made.loc + made.scale * seed
+        """A sample before tanh; `seed` is the noise, of the sample's shape."""
+        normal = self.create_dist(parameters)
+        return normal.loc + normal.scale * seed
 
 
 def normaliser(mask: Any) -> Callable[[Array, Any], Array]:
-    """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
-    shown = np.asarray(mask, np.float32)
-    return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * shown
+    """Function (observation, statistics) that normalises by running statistics and multiplies by `mask` (n,)."""
+    factor = np.asarray(mask, np.float32)
+    return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * factor

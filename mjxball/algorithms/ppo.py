@@ -11,13 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import (
-    Environments,
-    Phase,
-    PolicyNetwork,
-    Schedule,
-    Transition,
-)
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, Transition
 from mjxball.algorithms.networks import normaliser
 from mjxball.algorithms.recurrent import RecurrentPolicy, answer
 from mjxball.config import Config, Ppo
@@ -32,27 +26,24 @@ brax_ppo = import_brax_ppo()
 ADAM = optax.scale_by_adam()
 EPOCHS = 8  # passes over the rollout in an update
 VALUE_LAYERS = (64, 64)  # hidden layers of the state value
-FINAL_RATE = 0.02  # learning rate at the end of the run over that at its start
+FINAL_RATE = 0.02  # ratio of the last learning rate to the first
 GAE_LAMBDA = 0.95  # of the generalised advantage estimate
-CLIPPING = 0.2  # largest change of an action's probability that is rewarded
-REWARD_SCALE = 0.02  # factor on the reward: the value's loss shares the gradient's norm
+CLIPPING = 0.2  # epsilon of the clipped surrogate objective
+REWARD_SCALE = 0.02  # factor on the reward: the gradient's norm that is clipped contains the value's loss
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
 
 
 class PpoState(NamedTuple):
-    """What the algorithm knows."""
+    """State of `ProximalPolicyOptimization`."""
 
-    parameters: Any  # Brax's of policy and value
+    parameters: Any  # Brax's `PPONetworkParams`
     adam: Any
     normaliser: Any  # running mean and deviation of the observations
     rollout: Any  # Brax's `Transition`, the newest steps of all environments: (envs, unroll_length, ...)
 
 
 class ProximalPolicyOptimization:
-    """`collect` flies `ppo.unroll_length` steps, `update` learns from them alone.
-
-    See `mjxball.algorithms.base`.
-    """
+    """`collect` flies `ppo.unroll_length` steps, `update` learns from these alone (see `mjxball.algorithms.base`)."""
 
     metrics = ("loss", "policy_loss", "value_loss", "deviation")
     engines = ("mjx", "newton-euler")
@@ -69,7 +60,7 @@ class ProximalPolicyOptimization:
         self._mask = environments.policy_mask
         self._sizes = (environments.observation_size, environments.action_size - self._units)
         self.networks = make_networks(ppo, self._mask, self._sizes[1], environments.critic_mask)
-        self._of_unrolls = self.networks  # as the loss sees them: one answer for each step of an unroll
+        self._of_unrolls = self.networks  # as the loss calls them: on all steps of an unroll
         if self._units:
             parameters = self.networks.parametric_action_distribution.param_size
             policy = RecurrentPolicy(slots, (*ppo.policy_layers, parameters), self._mask)
@@ -77,7 +68,7 @@ class ProximalPolicyOptimization:
             self._of_unrolls = self.networks.replace(policy_network=SimpleNamespace(apply=policy.unroll))
 
     def init(self, key: Array) -> PpoState:
-        """Fresh networks, and a rollout of zeros."""
+        """Initial networks and a rollout of zeros."""
         policy_key, value_key = jax.random.split(key)
         parameters = brax_ppo.losses.PPONetworkParams(
             policy=self.networks.policy_network.init(policy_key), value=self.networks.value_network.init(value_key)
@@ -85,13 +76,15 @@ class ProximalPolicyOptimization:
         size, actions = self._sizes
         specification = brax.specs.Array((size,), jnp.dtype("float32"))
         shape = (self._environments.count, self.steps_per_collect)
-        seen, acted, none = jnp.zeros((*shape, size)), jnp.zeros((*shape, actions)), jnp.zeros(shape)
-        parameters_none = jnp.zeros((*shape, 2 * actions))
-        rollout = _rollout(Transition(seen, acted, none, none, seen, none), parameters_none, acted, none)
+        observation, action, scalar, policy_output = (
+            jnp.zeros((*shape, *last)) for last in ((size,), (actions,), (), (2 * actions,))
+        )
+        transition = Transition(observation, action, scalar, scalar, observation, scalar)
+        rollout = _rollout(transition, policy_output, action, scalar)
         return PpoState(parameters, ADAM.init(parameters), brax.running_statistics.init_state(specification), rollout)
 
     def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[PpoState, Any]:
-        """`steps_per_collect` steps of all environments; what was seen goes into the normaliser."""
+        """`steps_per_collect` steps of all environments, whose observations update the normaliser."""
         act_keys, fresh = jax.random.split(keys[0], self.steps_per_collect), self._environments.drawn(envs, keys[1])
         distribution = self.networks.parametric_action_distribution
 
@@ -108,14 +101,14 @@ class ProximalPolicyOptimization:
         normaliser = brax.running_statistics.update(
             state.normaliser, flown.observation, pmap_axis_name=self._shards.axis
         )
-        # In an evaluation nothing is remembered.
-        kept = state._replace(normaliser=normaliser, rollout=flown)
-        return jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), kept, state), envs
+        # An evaluation leaves the state unchanged.
+        updated = state._replace(normaliser=normaliser, rollout=flown)
+        return jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), updated, state), envs
 
     def update(
         self, state: PpoState, keys: Sequence[Array], progress: Array, phase: Phase
     ) -> tuple[PpoState, dict[str, Array]]:
-        """`EPOCHS` passes over the rollout in `minibatches` parts, the steps of an unroll together."""
+        """`EPOCHS` passes over the rollout in `minibatches` parts. The steps of an unroll stay together."""
         ppo, count = self._config, self._environments.count
         rate = ppo.learning_rate * (1.0 + (FINAL_RATE - 1.0) * progress)
         order_key, loss_key = jax.random.split(self._shards.own(keys[0]))
@@ -135,29 +128,29 @@ class ProximalPolicyOptimization:
                 clipping_epsilon=CLIPPING,
             )
 
-        def one(number: Array, carry: Any) -> Any:
+        def step(index: Array, carry: Any) -> Any:
             parameters, adam, _ = carry
-            batch = jax.tree.map(lambda leaf: leaf[batches[number]], state.rollout)
-            gradient, seen = jax.grad(loss, has_aux=True)(parameters, batch, jax.random.fold_in(loss_key, number))
+            batch = jax.tree.map(lambda leaf: leaf[batches[index]], state.rollout)
+            gradient, losses = jax.grad(loss, has_aux=True)(parameters, batch, jax.random.fold_in(loss_key, index))
             gradient = self._shards.mean(gradient)
             gradient, _ = optax.clip_by_global_norm(MAX_GRAD_NORM).update(gradient, optax.EmptyState())
             direction, adam = ADAM.update(gradient, adam)
             parameters = jax.tree.map(lambda value, along: value - rate * along, parameters, direction)
-            report = (seen["total_loss"], seen["policy_loss"], seen["v_loss"], seen["policy_dist_mean_std"])
+            report = (losses["total_loss"], losses["policy_loss"], losses["v_loss"], losses["policy_dist_mean_std"])
             return parameters, adam, jnp.stack(report)
 
         steps = jnp.where(phase.learning, len(batches), 0)
         start = (state.parameters, state.adam, jnp.zeros(len(self.metrics)))
-        parameters, adam, report = jax.lax.fori_loop(0, steps, one, start)
+        parameters, adam, report = jax.lax.fori_loop(0, steps, step, start)
         return state._replace(parameters=parameters, adam=adam), dict(zip(self.metrics, report, strict=True))
 
     def policy(self, state: PpoState) -> PolicyNetwork:
-        """The policy, and what it knows of its observations."""
+        """The current policy with its normalisation."""
         mask = jnp.asarray(self._mask, jnp.float32)
         return PolicyNetwork(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> PpoState:
-        """The rollout is cut, the rest is whole."""
+        """The rollout is cut by environments, the rest is whole."""
         return PpoState(whole, whole, whole, split)
 
     def check_parts(self, parts: int) -> None:
@@ -173,7 +166,7 @@ class ProximalPolicyOptimization:
 def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) -> Any:
     """Brax's PPO networks: tanh-squashed Gaussian policy and state value on normalised observations.
 
-    The value, which is never written, has the smooth units of Brax.
+    The value network, which is never exported, has Brax's smooth activation.
     """
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
     policy, value = (normaliser(shown) for shown in (mask, critic_mask))
@@ -196,26 +189,26 @@ def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) ->
 
 
 def _orders(key: Array, count: int) -> Int[Array, "epochs envs"]:
-    """The numbers below `count` in random orders.
+    """Random permutations of 0 ... `count` - 1, one for each epoch.
 
-    Each is the low bits of a random number. `jax.random.permutation` sorts keys with their values, and a sort of two
-    arrays on several devices is what XLA's partitioner ends the process by (`HandleSort`, jax 0.10.1 and 0.11.2).
+    They are the low bits of sorted random integers. `jax.random.permutation` sorts keys together with values, and on
+    several devices a sort of two arrays crashes XLA's partitioner (`HandleSort`, jax 0.10.1 and 0.11.2).
     """
     low = jnp.uint32((1 << (count - 1).bit_length()) - 1)
     bits = jax.random.bits(key, (EPOCHS, count), jnp.uint32)
     return (jnp.sort(bits & ~low | jnp.arange(count, dtype=jnp.uint32), axis=-1) & low).astype(jnp.int32)
 
 
-def _rollout(seen: Transition, parameters: Array, raw: Array, likely: Array) -> Any:
-    """Brax's container; `parameters` of the distribution that `raw`, an action before tanh, was drawn from."""
+def _rollout(transition: Transition, parameters: Array, raw: Array, log_prob: Array) -> Any:
+    """Brax's `Transition`; `raw`, the action before tanh, is a sample of the distribution with these `parameters`."""
     return brax.types.Transition(
-        observation=seen.observation,
-        action=seen.action,
-        reward=seen.reward,
-        discount=1 - seen.terminated,
-        next_observation=seen.next_observation,
+        observation=transition.observation,
+        action=transition.action,
+        reward=transition.reward,
+        discount=1 - transition.terminated,
+        next_observation=transition.next_observation,
         extras={
-            "state_extras": {"truncation": seen.done * (1 - seen.terminated)},
-            "policy_extras": {"raw_action": raw, "log_prob": likely, "distribution_params": parameters},
+            "state_extras": {"truncation": transition.done * (1 - transition.terminated)},
+            "policy_extras": {"raw_action": raw, "log_prob": log_prob, "distribution_params": parameters},
         },
     )

@@ -1,4 +1,4 @@
-"""A gated recurrent unit below a policy's layers: how it starts, and how it answers in sequences of steps."""
+"""Gated recurrent unit (GRU) in front of a policy's layers: initial weights, and outputs over sequences of steps."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ import numpy as np
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.arrays import Array
 
-SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # control steps that units of a GRU keep their state for at the start
-RECURRENT_GAIN = 0.7  # of a GRU's orthogonal recurrent weights at the start
+SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # initial time constants of a GRU's units [control steps]
+RECURRENT_GAIN = 0.7  # gain of a GRU's initial, orthogonal recurrent weights
 
 
 def fresh_layers(key: Array, inputs: int, units: int, sizes: Sequence[int]) -> dict[str, Any]:
-    """Weights as Flax draws them (LeCun's), near 0 in the last layer: the first policy adds hardly anything.
+    """Initial weights as Flax samples them (LeCun uniform), times 0.01 in the last layer: actions start close to 0.
 
-    `sizes` of all layers, the last of which gives mean and deviation of the action. With `units` the first layer sees a
-    GRU's state and `inputs`, and the last one that state as well.
+    `sizes`: outputs of each layer; the last layer gives mean and deviation of the action. With `units` the first layer
+    takes a GRU's state and the `inputs`, and the last layer takes that state too.
     """
     layers = {}
     if units:
-        key, own = jax.random.split(key)
-        layers["gru"] = _fresh_gru(own, inputs, units)
+        key, layer_key = jax.random.split(key)
+        layers["gru"] = _fresh_gru(layer_key, inputs, units)
     rows = units + inputs
-    for number, columns in enumerate(sizes):
-        key, own = jax.random.split(key)
-        last = number == len(sizes) - 1
-        kernel = jax.nn.initializers.lecun_uniform()(own, (rows + (units if last else 0), columns))
-        layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
+    for index, columns in enumerate(sizes):
+        key, layer_key = jax.random.split(key)
+        last = index == len(sizes) - 1
+        kernel = jax.nn.initializers.lecun_uniform()(layer_key, (rows + (units if last else 0), columns))
+        layers[f"hidden_{index}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
         rows = columns
     return layers
 
 
 def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
-    """A GRU at the start: orthogonal recurrent weights, and units that forget within 1.5 to 150 control steps."""
+    """Initial GRU: orthogonal recurrent weights, time constants log-uniform in 1.5 to 150 control steps."""
     kernel, recurrent, memory = jax.random.split(key, 3)
     square = jax.nn.initializers.orthogonal(RECURRENT_GAIN)
-    blocks = [square(own, (units, units)) for own in jax.random.split(recurrent, 3)]
+    blocks = [square(block_key, (units, units)) for block_key in jax.random.split(recurrent, 3)]
     low, high = np.log(SHORTEST_MEMORY), np.log(LONGEST_MEMORY)
     steps = jnp.exp(jax.random.uniform(memory, (units,), minval=low, maxval=high))
     return {
@@ -51,19 +51,19 @@ def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
 
 
 class RecurrentPolicy(NamedTuple):
-    """In place of Brax's policy network (`init`, `apply`) for observations that hold the GRU's state."""
+    """Replacement of Brax's policy network (`init`, `apply`) for observations that contain the GRU's state."""
 
-    slots: slice  # of an observation that hold the state; the network's inputs stand before them
+    slots: slice  # entries of an observation that hold the state; they follow the network's inputs
     sizes: tuple[int, ...]  # of all layers, see `fresh_layers`
-    mask: Any  # (n,) of observations
+    mask: Any  # (n,) 1 for entries of an observation that the policy uses, else 0
 
     @property
     def units(self) -> int:
-        """Of the GRU."""
+        """Number of units of the GRU."""
         return self.slots.stop - self.slots.start
 
     def init(self, key: Array) -> Any:
-        """Fresh parameters."""
+        """Initial parameters."""
         return {"params": fresh_layers(key, self.slots.start, self.units, self.sizes)}
 
     def step(self, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
@@ -72,29 +72,29 @@ class RecurrentPolicy(NamedTuple):
         return network.outputs(observation)
 
     def apply(self, statistics: Any, policy: Any, observation: Array) -> Array:
-        """The first of `step`, by the state that every `observation` (..., n) holds."""
+        """Parameters of the action's distribution (..., 2 a), from the state in each `observation` (..., n)."""
         return self.step(statistics, policy, observation)[0]
 
     def unroll(self, statistics: Any, policy: Any, observations: Array) -> Array:
-        """The same (T, B, 2 a) of sequences (T, B, n), whose states follow from the first ones that they hold.
+        """Parameters of the action's distribution (T, B, 2 a) along sequences of `observations` (T, B, n).
 
-        So the states are those of `policy`, and gradients go back through them. An episode begins with a state of
-        zeros, which stays.
+        Only the first stored state of a sequence is used. The following states are computed with `policy`, so that
+        gradients flow back through them. A stored state of zeros marks the start of an episode and resets the state.
         """
-        held = observations[..., self.slots]
+        stored = observations[..., self.slots]
 
-        def one(state: Array, seen: tuple[Array, Array]) -> tuple[Array, Array]:
-            observation, kept = seen
-            state = jnp.where((kept == 0).all(axis=-1, keepdims=True), 0.0, state)
+        def one(state: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+            observation, stored_state = inputs
+            state = jnp.where((stored_state == 0).all(axis=-1, keepdims=True), 0.0, state)
             parts = [observation[..., : self.slots.start], state, observation[..., self.slots.stop :]]
-            found, state = self.step(statistics, policy, jnp.concatenate(parts, axis=-1))
-            return state, found
+            parameters, state = self.step(statistics, policy, jnp.concatenate(parts, axis=-1))
+            return state, parameters
 
-        return jax.lax.scan(one, held[0], (observations, held))[1]
+        return jax.lax.scan(one, stored[0], (observations, stored))[1]
 
 
 def answer(network: Any, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
-    """(parameters of the action's distribution, next state) of any policy network; without a GRU a state (..., 0)."""
+    """(parameters of the action's distribution, next state (..., H)) of any policy network; H is 0 without a GRU."""
     if isinstance(network, RecurrentPolicy):
         return network.step(statistics, policy, observation)
     return network.apply(statistics, policy, observation), observation[..., :0]

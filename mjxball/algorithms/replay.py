@@ -1,4 +1,4 @@
-"""Ring-buffer replay: rows are overwritten in place, nothing is ever copied or rolled."""
+"""Replay as a ring buffer: the oldest rows are overwritten in place, and no row is ever moved."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Transitions(NamedTuple):
-    """A batch of transitions. `discount` is 0 after a termination (a time limit is none), else gamma^(n-1)."""
+    """A batch of transitions. `discount` is 0 after a termination (not after a time limit), else gamma^(n-1)."""
 
     observation: Float[Array, "... n"]
     action: Float[Array, "... actions"]  # in [-1, 1]
@@ -25,10 +25,10 @@ class Transitions(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """`rows` holds the capacity and, behind it, one step of scratch rows for steps that are not recorded."""
+    """The ring buffer, followed by scratch rows for one step that is not recorded."""
 
     rows: Float[Array, "rows width"]  # capacity + environments, 2 n + 6
-    inserted: Int[Array, ""]  # transitions ever recorded, folded at twice the capacity
+    inserted: Int[Array, ""]  # transitions recorded so far, kept below twice the capacity
 
 
 def create(capacity: int, num_envs: int, observation_size: int, action_size: int) -> Replay:
@@ -38,13 +38,13 @@ def create(capacity: int, num_envs: int, observation_size: int, action_size: int
 
 
 def insert(replay: Replay, transitions: Transitions, record: Bool[Array | np.ndarray, ""]) -> Replay:
-    """Write one step of all worlds (worlds, ...) over the oldest rows, or to scratch unless `record`."""
+    """Write one step of all environments (envs, ...) over the oldest rows, or to the scratch rows unless `record`."""
     columns = [column if column.ndim == 2 else column[:, None] for column in transitions]
     rows = jnp.concatenate(columns, axis=-1)
     num_envs = rows.shape[0]
     capacity = replay.rows.shape[0] - num_envs
     slot = jnp.where(record, replay.inserted % capacity, capacity)
-    # A counter past 2 x capacity is folded back, so that int32 never overflows and `% capacity` is unchanged.
+    # Subtracting the capacity leaves `% capacity` unchanged, and int32 never overflows.
     count = replay.inserted + jnp.where(record, num_envs, 0)
     count = jnp.where(count >= 2 * capacity, count - capacity, count)
     return Replay(jax.lax.dynamic_update_slice_in_dim(replay.rows, rows, slot, axis=0), count)
@@ -59,10 +59,10 @@ def sample(
     steps: int,
     discount: Float[Array, ""] | float,
 ) -> Transitions:
-    """Transitions of up to `steps` steps, one for each of `draws`, uniform 32-bit numbers, of those recorded.
+    """Sampled n-step transitions, one for each of `draws`, which are uniform 32-bit integers.
 
     Rewards are summed with `discount` (gamma) until `steps` or the episode's end, whichever comes first.
-    The buffer must hold at least `steps` steps of all worlds.
+    The buffer must hold at least `steps` steps of all environments.
     """
     capacity = replay.rows.shape[0] - num_envs
     first = _starts(replay, draws, num_envs, steps)
@@ -92,20 +92,20 @@ def sample(
 def observations(
     replay: Replay, draws: UInt[Array, " batch"], num_envs: int, observation_size: int, steps: int
 ) -> Float[Array, "steps batch n"]:
-    """Observations of `steps` steps in a row of one world, whose episode may end among them, for each of `draws`."""
+    """Observations of `steps` consecutive steps of one environment for each of `draws`. Its episode may end within."""
     capacity = replay.rows.shape[0] - num_envs
     following = _starts(replay, draws, num_envs, steps) + num_envs * jnp.arange(steps)[:, None]
     return replay.rows[following % capacity, :observation_size]
 
 
 def _starts(replay: Replay, draws: UInt[Array, " batch"], num_envs: int, steps: int) -> Int[Array, " batch"]:
-    """Rows, before they are folded at the capacity, from which on `steps` steps are recorded."""
+    """Sampled indices of rows, to be taken modulo the capacity, each followed by `steps` - 1 recorded steps."""
     capacity = replay.rows.shape[0] - num_envs
     size = jnp.minimum(replay.inserted, capacity)
     oldest = jnp.where(replay.inserted < capacity, 0, replay.inserted)
-    found = jnp.maximum(size - (steps - 1) * num_envs, 1)
-    age = (draws % found.astype(draws.dtype)).astype(found.dtype)  # uneven by less than `found` / 2^32
-    return oldest + age
+    eligible = jnp.maximum(size - (steps - 1) * num_envs, 1)
+    # The remainder deviates from a uniform distribution by less than `eligible` / 2^32.
+    return oldest + (draws % eligible.astype(draws.dtype)).astype(eligible.dtype)
 
 
 def _unpack(rows: Float[Array, "batch width"], observation_size: int, action_size: int) -> Transitions:

@@ -1,4 +1,4 @@
-"""Soft actor-critic on Brax's networks and losses, or on the paper's with a state value."""
+"""Soft actor-critic on Brax's networks and losses, or on the paper's losses with a state value."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ POLICY_EMA_RATE = 0.002  # of the exported running average of the policy
 
 
 class Learner(NamedTuple):
-    """Everything that an update changes."""
+    """Parameters, optimiser states and statistics that an update changes."""
 
     policy: Any
     critic: Any
@@ -55,7 +55,7 @@ class Losses(NamedTuple):
 
 
 def create(networks: Networks, config: Sac, observation_size: int, key: Array) -> Learner:
-    """A fresh learner."""
+    """Initial parameters, optimiser states and statistics."""
     policy_key, critic_key = jax.random.split(key)
     policy, critic = networks.policy_network.init(policy_key), networks.q_network.init(critic_key)
     value = networks.value_network.init(jax.random.fold_in(critic_key, 1)) if config.state_value else ()
@@ -81,11 +81,11 @@ def make_update(
 ) -> Any:
     """Return `update(learner, transitions, noise, rate, seen) -> (learner, losses)`; `rate` scales all learning rates.
 
-    A recurrent policy learns from what is `seen` in sequences, as many observations as there are `transitions`.
+    A recurrent policy learns from the observations `seen` in sequences, in all as many as there are `transitions`.
     `noise` (2, batch, actions) is standard normal: one part for the critic's next actions, one for the policy's.
     `mean` averages gradients and entropies over learners that share their parameters (data parallel).
     """
-    # The policy's loss takes the network's output in place of its parameters, since the entropy needs the output too.
+    # The policy's loss takes the network's output instead of its parameters, because the entropy needs the output too.
     of_output = networks._replace(policy_network=SimpleNamespace(apply=lambda normaliser, output, observation: output))
     _, critic_loss, _ = brax.losses.make_losses(networks, config.reward_scale, config.discount, action_size)
     _, _, policy_loss = brax.losses.make_losses(of_output, config.reward_scale, config.discount, action_size)
@@ -117,11 +117,11 @@ def make_update(
         return learner._replace(critic=critic, critic_adam=adam, target=target), value
 
     def outputs(policy: Any, normaliser: Any, seen: Float[Array, "... n"]) -> Float[Array, "batch parameters"]:
-        """Of every step of sequences, if there are any: the policy's answers by what it remembers of them itself."""
+        """Distribution parameters at `seen`, observations (batch, n) or sequences of them (steps, sequences, n)."""
         if seen.ndim == 2:
             return networks.policy_network.apply(normaliser, policy, seen)
-        found = networks.policy_network.unroll(normaliser, policy, seen)
-        return found.reshape(-1, found.shape[-1])
+        parameters = networks.policy_network.unroll(normaliser, policy, seen)
+        return parameters.reshape(-1, parameters.shape[-1])
 
     def policy_step(
         before: Learner,
@@ -131,7 +131,7 @@ def make_update(
         noise: Float[Array, "batch actions"],
         rate: Float[Array, ""],
     ) -> tuple[Learner, Losses]:
-        """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
+        """Step of policy and temperature. It uses the critic `before` this batch's critic step, as Brax does."""
         output, back = jax.vjp(lambda policy: outputs(policy, before.normaliser, seen), before.policy)
         batch = batch._replace(observation=seen.reshape(-1, seen.shape[-1]))
         action = distribution.sample_no_postprocessing(output, noise)
@@ -173,7 +173,7 @@ def make_update(
 def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
     """`(value_loss(value, learner, batch, noise), q_loss(critic, learner, batch))`, the paper's eqs. 6 and 7.
 
-    The paper prints them without the temperature; here it stands where Haarnoja et al. (2018) put it:
+    The paper omits the temperature alpha; here it enters as in Haarnoja et al. (2018):
     V(s) -> E[min Q(s, a) - alpha log pi(a|s)], Q(s, a) -> r + gamma V'(s'), with V' the slow copy of V.
     """
     distribution = networks.parametric_action_distribution
@@ -182,29 +182,30 @@ def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
         parameters = networks.policy_network.apply(learner.normaliser, learner.policy, batch.observation)
         action = distribution.sample_no_postprocessing(parameters, noise)
         log_probability = distribution.log_prob(parameters, action)
-        chosen = distribution.postprocess(action)
-        q = networks.q_network.apply(learner.normaliser, learner.critic, batch.observation, chosen).min(axis=-1)
-        wanted = q - jnp.exp(learner.log_alpha) * log_probability
+        squashed = distribution.postprocess(action)
+        q = networks.q_network.apply(learner.normaliser, learner.critic, batch.observation, squashed).min(axis=-1)
+        target = q - jnp.exp(learner.log_alpha) * log_probability
         return 0.5 * jnp.mean(
-            (networks.value_network.apply(learner.normaliser, value, batch.observation) - wanted) ** 2
+            (networks.value_network.apply(learner.normaliser, value, batch.observation) - target) ** 2
         )
 
     def q_loss(critic: Any, learner: Learner, batch: Any) -> Float[Array, ""]:
         q = networks.q_network.apply(learner.normaliser, critic, batch.observation, batch.action)
         after = networks.value_network.apply(learner.normaliser, learner.target, batch.next_observation)
-        wanted = batch.reward * config.reward_scale + batch.discount * config.discount * after
-        return 0.5 * jnp.mean((q - wanted[:, None]) ** 2)
+        target = batch.reward * config.reward_scale + batch.discount * config.discount * after
+        return 0.5 * jnp.mean((q - target[:, None]) ** 2)
 
     return value_loss, q_loss
 
 
 def _descend(value: Any, gradient: Any, adam: Any, step: Float[Array, ""]) -> tuple[Any, Any]:
+    """(`value`, state of Adam) after one step of Adam with learning rate `step`."""
     direction, adam = ADAM.update(gradient, adam)
     return jax.tree.map(lambda v, d: v - step * d, value, direction), adam
 
 
 def _brax_transitions(batch: Transitions) -> Any:
-    """Brax's container. `truncation` stays 0: a time limit bootstraps from the true last observation instead."""
+    """Brax's `Transition`. `truncation` stays 0: a time limit bootstraps from the true last observation instead."""
     truncation = jnp.zeros_like(batch.reward)
     return brax.types.Transition(
         observation=batch.observation,
@@ -217,14 +218,14 @@ def _brax_transitions(batch: Transitions) -> Any:
 
 
 class SacState(NamedTuple):
-    """What SAC knows."""
+    """State of `SoftActorCritic`."""
 
     learner: Learner
     replay: Replay
 
 
 class SoftActorCritic:
-    """The algorithm as the trainer sees it (`mjxball.algorithms.base.Algorithm`)."""
+    """Soft actor-critic behind the trainer's interface (`mjxball.algorithms.base.Algorithm`)."""
 
     metrics = ("alpha", "entropy", "critic_loss", "policy_loss")
     engines = ("mjx", "newton-euler")
@@ -249,7 +250,7 @@ class SoftActorCritic:
         self._update = make_update(self.networks, sac, self._sizes[1], self._shards.mean)
 
     def init(self, key: Array) -> SacState:
-        """A fresh learner and an empty replay."""
+        """Initial learner and an empty replay."""
         capacity = self._config.replay_size // self._shards.parts
         return SacState(
             create(self.networks, self._config, self._sizes[0], key),
@@ -257,7 +258,7 @@ class SoftActorCritic:
         )
 
     def collect(self, state: SacState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[SacState, Any]:
-        """One step of all environments into the replay and the normaliser."""
+        """One step of all environments, which enters the replay and the normaliser."""
         learner, (*act_keys, reset_key) = state.learner, keys
         action, memory = self._act(learner, envs.states.obs, act_keys, phase)
         envs, transition = self._environments.step(envs, jnp.concatenate([action, memory], axis=-1), reset_key)
@@ -313,39 +314,39 @@ class SoftActorCritic:
         draws = jax.random.bits(draws_key, shape, jnp.uint32)
         noise = jax.random.normal(noise_key, (shape[0], 2, shape[1], self._sizes[1]))
         batches = jax.vmap(
-            lambda drawn: replay.sample(
-                state.replay, drawn, self._environments.count, *self._sizes, sac.n_step, sac.discount
+            lambda bits: replay.sample(
+                state.replay, bits, self._environments.count, *self._sizes, sac.n_step, sac.discount
             )
         )(draws)
         seen = self._sequences(state.replay, draws) if self._units else None
-        # Drawn once for all updates, and kept: XLA would draw, gather and sum anew wherever a number is used.
+        # Sampled once for all updates. Without the barrier XLA would sample, gather and sum again at every use.
         batches, noise, seen = jax.lax.optimization_barrier((batches, noise, seen))
 
-        def one(number: Int[Array, ""], carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
-            own, sequences = jax.tree.map(lambda part: part[number], (batches, seen))
-            return self._update(carry[0], own, noise[number], rate, sequences)
+        def one(index: Int[Array, ""], carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
+            batch, sequences = jax.tree.map(lambda part: part[index], (batches, seen))
+            return self._update(carry[0], batch, noise[index], rate, sequences)
 
         zero = jnp.zeros(())
         return jax.lax.fori_loop(0, sac.updates_per_step, one, (state.learner, Losses(zero, zero, zero)))
 
     def _sequences(self, memory: Replay, draws: Array) -> Float[Array, "updates steps sequences n"]:
-        """Observations in sequences, a batch of them in all for each update."""
+        """Sampled sequences of observations. Those of one update contain a batch of observations in all."""
         firsts = draws[:, : draws.shape[1] // self._steps]
         count, size, steps = self._environments.count, self._sizes[0], self._steps
-        return jax.vmap(lambda drawn: replay.observations(memory, drawn, count, size, steps))(firsts)
+        return jax.vmap(lambda bits: replay.observations(memory, bits, count, size, steps))(firsts)
 
     def policy(self, state: SacState) -> PolicyNetwork:
-        """The running average of the policy, and what it knows of its observations."""
+        """The running average of the policy, with its normalisation."""
         learner = state.learner
         mask = jnp.asarray(self._mask, jnp.float32)
         return PolicyNetwork(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> SacState:
-        """The replay's rows are cut, the learner is whole."""
+        """The replay's rows are cut by environments, the rest is whole."""
         return SacState(whole, Replay(rows=split, inserted=whole))
 
     def check_parts(self, parts: int) -> None:
-        """Raise InputError unless environments, batch and replay can be cut into `parts`."""
+        """Raise InputError unless environments, batch and replay can be cut into `parts` equal parts."""
         sac = self._config
         for name, whole in (
             ("num_envs", parts),

@@ -1,1 +1,1 @@
-"""The command lines that join training, export and evaluation. They stand above every other part of the package."""
+"""Command lines of training and evaluation. No other part of the package imports them."""

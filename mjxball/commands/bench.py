@@ -14,7 +14,7 @@ from mjxball.train.run_directory import commit, versions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Of `eval.py bench`."""
+    """Add the arguments of `eval.py bench`."""
     parser.add_argument("follower", metavar="FOLLOWER", help="a policy, MODEL.onnx, module:Class, or a baseline's name")
     about = f"tracks to fly: {', '.join(TRACKS)} (default all)"
     parser.add_argument("--tracks", nargs="+", choices=TRACKS, default=list(TRACKS), metavar="NAME", help=about)
@@ -24,15 +24,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, command: str) -> int:
-    """Fly and write; return the exit code."""
+    """Fly the tracks and write the entry; return the exit code."""
     from mjxball.bench.entry import run as fly
     from mjxball.bench.entry import table
     from mjxball.bench.followers import entrant
 
     cli.output_file(options.out, ".json")
     name, make = entrant(options.follower)
-    found = fly(name, make, options.tracks, options.draw, clock())
-    known = {"command": command, "commit": commit(), "versions": versions()}
-    write_whole(options.out, json.dumps({**found, **known}, indent=1, allow_nan=False) + "\n")
-    print(f"{table(found)}\nthe entry is {options.out}")
+    entry = fly(name, make, options.tracks, options.draw, clock())
+    origin = {"command": command, "commit": commit(), "versions": versions()}
+    write_whole(options.out, json.dumps({**entry, **origin}, indent=1, allow_nan=False) + "\n")
+    print(f"{table(entry)}\nthe entry is {options.out}")
     return 0

@@ -1,4 +1,4 @@
-"""What comes of a training: its policy, and every member of a population, compared on standard scenarios."""
+"""Comparison after training: the exported policy, and every member of a population, on the standard scenarios."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from mjxball.train.run_directory import POLICY
 
 
 def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
-    """Print every member on the reference scenario and their median, draw them over training, and tell the card."""
+    """Fly every member on the reference scenario; print their metrics, the median and the range.
+
+    The metrics also go into the metadata of the exported policy file, and the learning curves to eval/members.png.
+    """
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import fly_scenarios, table
     from mjxball.policy.file import load_file, save_file
@@ -26,16 +29,17 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
     results = fly_scenarios(settings, policies, [reference], origin["physics"])
     print(table(results, reference))
     compared = ("rmse", "settling_time", "x_peak", "overshoot")
-    chosen = load_file(out / POLICY)
+    exported = load_file(out / POLICY)
     seeds = [int(result.follower.removeprefix("seed")) for result in results]
     spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in results] for name in compared}
     spread["failed"] = [result.metrics.failed for result in results]
-    save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
+    card = {**exported.card, "population": {"seed": seeds, **spread}}
+    save_file(out / POLICY, dataclasses.replace(exported, card=card))
     for name in compared:
         values = sorted(math.inf if value is None else value for value in spread[name])
-        numbers = (statistics.median(values), values[0], values[-1])
+        summary = (statistics.median(values), values[0], values[-1])
         missing = "never" if name == "settling_time" else "failed"
-        middle, low, high = (missing if math.isinf(value) else f"{value:.4g}" for value in numbers)
+        middle, low, high = (missing if math.isinf(value) else f"{value:.4g}" for value in summary)
         print(f"{name}: median {middle}, best {low}, worst {high} of {len(values)}")
     (out / "eval").mkdir(exist_ok=True)
     draw_members(out, out / "eval" / "members.png")
@@ -46,12 +50,12 @@ def _seed_of(path: Path) -> int:
 
 
 def is_evaluated(origin: dict[str, Any]) -> bool:
-    """Whether what was trained is compared with `copy`: that and the standard scenarios are for ours alone."""
+    """Whether the trained policy can be compared with `copy`: only with our own environment."""
     return not (origin.get("extensions") or {}).get("env")
 
 
 def compile_ahead(settings: config.Config, physics: str) -> None:
-    """Import and compile what `compare` needs, while the device trains: on two cores it then begins at once."""
+    """Import and compile what `compare` needs while the device trains, so that it starts at once on two cores."""
     import jax
 
     from mjxball.baselines import make_baseline
@@ -59,16 +63,16 @@ def compile_ahead(settings: config.Config, physics: str) -> None:
     from mjxball.sim.rollout import simulate_batch
 
     if jax.default_backend() != "cpu":
-        return  # a GPU trains for so short a time that this would only delay its host
+        return  # training on a GPU is so short that this would only delay its host
     pyplot()
     period = settings.timing.control_period
     scenarios = [dataclasses.replace(one, seconds=period) for one in standard_scenarios(settings)]
-    copies = [make_baseline("copy", settings) for _ in range(2)]  # as many flights as it will be
+    copies = [make_baseline("copy", settings) for _ in range(2)]  # the batch size that `compare` flies
     simulate_batch(settings, [(copy, scenarios) for copy in copies], physics)
 
 
 def compare(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
-    """Compare the exported policy with `copy` on its own plant and physics; figures go to DIR/eval."""
+    """Compare the exported policy with `copy` on the plant and engine of training; figures go to `out`/eval."""
     from mjxball.baselines import make_baseline
     from mjxball.evaluate.plots import write_results
     from mjxball.evaluate.policies import check_bounds, load_policy

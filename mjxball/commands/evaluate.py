@@ -1,4 +1,4 @@
-"""Command line of `eval.py`: what is flown, by the first word."""
+"""Command line of `eval.py`. The first word selects the command, `fly` by default."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WHOLE = ("-h", "--help", "--version", "--print-completion")  # flags of the prog
 
 
 def parser() -> cli.Parser:
-    """The argument parser of `eval.py`; without a command it takes the flags of `fly`."""
+    """Argument parser of `eval.py`, which also lists the flags of `fly`."""
     result = cli.make_parser(
         "eval.py",
         description="Judge followers on a CPU. Without a command: fly, whose flags are listed here.",
@@ -31,7 +31,7 @@ def parser() -> cli.Parser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Evaluate; return the exit code."""
+    """Run the command; return the exit code."""
     given = sys.argv[1:] if arguments is None else arguments
     named = given and (given[0] in COMMANDS or given[0].partition("=")[0] in WHOLE)
     options = parser().parse_args(given if named else ["fly", *given])

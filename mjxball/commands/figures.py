@@ -21,7 +21,7 @@ from mjxball.train.run_directory import versions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Of `eval.py figures`."""
+    """Add the arguments of `eval.py figures`."""
     add_policies(parser)
     names = paper_figures.NAMES
     about = f"figures to draw: {', '.join(names)} (default all)"
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, command: str) -> int:
-    """Fly and draw; return the exit code."""
+    """Fly, draw the figures and write their page; return the exit code."""
     names = [name for name in paper_figures.NAMES if name in options.only]
     cli.output_directory(options.out)
     paths = options.policies or [path for path in shipped_policies() if _setup_of(path)]
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace, command: str) -> int:
 
 
 def _setup_of(path: Path) -> Config | None:
-    """The configuration that the policy file `path` flies with in the figures, None if it fits none."""
+    """Configuration in which the figures fly the policy file `path`; None if they cannot."""
     if paper_figures.on_stand(Policy.load(path)):
         return stand_config()
     return preset("paper") if native_config(path) is None else None

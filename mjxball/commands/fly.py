@@ -28,13 +28,13 @@ from mjxball.train.run_directory import versions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Of `eval.py fly`."""
+    """Add the arguments of `eval.py fly`."""
     add_policies(parser)
     add_flags(parser)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Those of its arguments that `eval.py` takes without the word `fly` as well."""
+    """Add the flags of `eval.py fly`, which `eval.py` lists too."""
     add_followers(parser)
     parser.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
     parser.add_argument(
@@ -80,27 +80,27 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Group:
-    """Followers that fly the same plant."""
+    """Followers that fly the same plant and scenarios."""
 
     setup: config.Config
     scenarios: Sequence[Scenario]
     followers: Named
 
     def policies(self, options: argparse.Namespace) -> list[Policy]:
-        """The policies, loaded to fit the plant; raise InputError for bounds that are wanted and missing."""
-        # A pitch frequency that was asked for is an experiment, not a mistake.
-        longest, laws = max(scenario.seconds for scenario in self.scenarios), options.wn_pitch is None
-        found = load(self.followers.paths, lambda path: self.setup, options.force, laws, longest)
-        unbounded = [policy.name for policy in found if options.check and not policy.card["bounds"]]
+        """The policies, loaded for the plant. Raises InputError if `--check` is given and one has no bounds."""
+        # --wn-pitch changes the attitude loops on purpose, so they may differ from the policy's.
+        longest, compare_laws = max(scenario.seconds for scenario in self.scenarios), options.wn_pitch is None
+        policies = load(self.followers.paths, lambda path: self.setup, options.force, compare_laws, longest)
+        unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
         if unbounded:
             raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
-        return found
+        return policies
 
 
 def run(options: argparse.Namespace, command: str) -> int:
-    """Fly every plant's scenarios; return the exit code.
+    """Fly the scenarios of every plant; return the exit code.
 
-    The report of a plant other than the first one's has a directory of its own.
+    The report of each plant after the first goes to a subdirectory of `--out`.
     """
     if options.style != "screen" and options.out is None:
         raise InputError("--style belongs to figures, and needs --out DIR")
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace, command: str) -> int:
     loaded = [(group, group.followers.made(group.setup, BASELINES), group.policies(options)) for group in groups]
     for _, baselines, policies in loaded:
         refuse_same_names([*(follower.name for follower in baselines), *(policy.name for policy in policies)])
-    every: list[Result] = []
+    written: list[Result] = []
     code = 0
     for number, (group, baselines, policies) in enumerate(loaded):
         results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
@@ -123,8 +123,8 @@ def run(options: argparse.Namespace, command: str) -> int:
         if options.plant or group.setup.plant != config.Plant():
             print(rig_line(group.setup, max(scenario.mass for scenario in group.scenarios)))
         print(table(results, standard_scenarios(group.setup)[0]))
-        if not number or groups[0].followers.asked:  # without arguments the JSON is about the paper's plant alone
-            every += results
+        if not number or groups[0].followers.asked:  # without arguments the JSON holds the paper's plant alone
+            written += results
         if options.out:
             place = options.out / group.setup.preset if number else options.out
             write_results(results, place, options.style)
@@ -134,26 +134,30 @@ def run(options: argparse.Namespace, command: str) -> int:
         if options.check:
             code = max(code, _check(group.setup, policies, results, options.physics))
     if options.json:
-        write_whole(options.json, to_json(every))
+        write_whole(options.json, to_json(written))
     return code
 
 
 def _groups(options: argparse.Namespace, setup: config.Config, scenarios: Sequence[Scenario]) -> list[Group]:
-    who = named(options)
-    if options.check and not who.paths:
+    """Followers by plant: those that fly `setup`, then policies that were made for other plants, with baselines."""
+    selected = named(options)
+    if options.check and not selected.paths:
         raise InputError("--check needs a policy")
-    here, others = (who.paths, []) if options.force or options.plant else group_by_plant(who.paths)
-    # Only policies for other plants: then the baselines beside them fly theirs, and nothing the paper's.
-    groups = [] if others and not here else [Group(setup, scenarios, Named(who.names, here, who.asked))]
-    for own, files in others:
-        groups.append(Group(own, native_scenarios(options, own), Named(who.names or ["copy"], files, True)))
+    here, others = (selected.paths, []) if options.force or options.plant else group_by_plant(selected.paths)
+    # If all policies are for other plants, the baselines fly those alone, and no follower flies `setup`.
+    groups = [] if others and not here else [Group(setup, scenarios, Named(selected.names, here, selected.asked))]
+    for native, files in others:
+        groups.append(Group(native, native_scenarios(options, native), Named(selected.names or ["copy"], files, True)))
     return groups
 
 
 def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[Result], physics: str) -> int:
-    """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
-    own = setup.autopilot.kind != "ideal" or setup.plant != config.Plant()
-    plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
+    """Compare every policy with its bounds on the reference scenario; return the exit code, 1 if one misses them.
+
+    On the paper's plant the reference has the default attitude loops and CG motion. A result that is missing is flown.
+    """
+    other_plant = setup.autopilot.kind != "ideal" or setup.plant != config.Plant()
+    plain = setup if other_plant else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
     reference = standard_scenarios(plain)[0]
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]

@@ -1,4 +1,4 @@
-"""Followers that a command line names: policies, baselines and the user's own, loaded to fit a plant."""
+"""Followers named on a command line: policies, baselines and the user's classes, loaded for a plant."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ from mjxball.terminal import Status, warn
 
 
 def add_policies(parser: argparse.ArgumentParser) -> None:
-    """The positional arguments of a command that flies policies."""
+    """Add the positional arguments of a command that flies policies."""
     about = "policy files, or names of shipped ones"
     parser.add_argument("policies", nargs="*", type=policy_path, metavar="POLICY.npz", help=about)
 
 
 def add_followers(parser: argparse.ArgumentParser) -> None:
-    """The flag of a command that flies other followers as well."""
+    """Add the flag of a command that flies other followers too."""
     about = f"baselines: {', '.join(LAWS)}; or module:Class, your own"
     parser.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=about)
 
 
 def add_flight(parser: argparse.ArgumentParser) -> None:
-    """The flags of a command that flies on an engine of choice."""
+    """Add the flags that select the physics engine and allow policies of other plants."""
     parser.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
     parser.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
 
 
 @dataclass(frozen=True)
 class Named:
-    """Followers that were asked for: `names` of baselines and classes, `paths` of policies; all of both if none was."""
+    """Followers named on the command line."""
 
-    names: list[str]
-    paths: list[Path]
-    asked: bool
+    names: list[str]  # of baselines and classes
+    paths: list[Path]  # of policy files; every shipped one if no follower was named
+    asked: bool  # whether a follower was named
 
     def made(self, config: Config, every: Sequence[str]) -> list[Follower]:
-        """Those that are no policies, for the plant of `config`; `every` one of these names if none was asked for."""
+        """The followers that are no policies, for the plant of `config`; those named `every` if none was named."""
         return [_maker(name)(config) for name in dict.fromkeys(self.names if self.asked else every)]
 
 
 def named(options: argparse.Namespace) -> Named:
-    """Raises InputError for a follower that there is not."""
-    # `--followers copy mine.npz` reads as it looks: a file name among the followers is a policy.
+    """The followers that `options` name. Raises InputError for an unknown one."""
+    # In `--followers copy mine.npz` the file name is a policy.
     files = [*options.policies, *(Path(name) for name in options.followers if name.endswith(".npz"))]
     names = [name for name in options.followers if not name.endswith(".npz")]
     for name in names:
@@ -73,9 +73,10 @@ def load(
     compare_laws: bool = True,
     seconds: float = 0.0,
 ) -> list[Policy]:
-    """The policies, each to fit the configuration of its file, for flights of up to `seconds` [s].
+    """The policies, each loaded for the configuration `setup_of` its path, for flights of up to `seconds` [s].
 
-    Files of one stem are called by their directory too, forced ones carry a mark in their name.
+    InputError if one does not fit, unless `force`, which marks its name. Files with equal stems are named with their
+    directory.
     """
     policies = []
     for path in paths:
@@ -97,13 +98,13 @@ def load(
 
 
 def refuse_same_names(names: list[str]) -> None:
-    """Raise InputError if two followers would be one row of a table."""
+    """Raise InputError if two followers have the same name, which identifies a row of a table."""
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two followers are called {name!r}; rename a policy file")
 
 
 def clock() -> Callable[[str], None]:
-    """What says on stderr how far a command is, and after how long."""
+    """A function that prints the time since this call and a text on stderr, to show progress."""
     started, status = time.monotonic(), Status()
     return lambda text: status.say(f"{time.monotonic() - started:6.1f} s  {text}")

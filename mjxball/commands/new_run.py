@@ -1,4 +1,4 @@
-"""What `train.py` is asked to train: settings, origin and directory of a run, or why not."""
+"""Settings, origin and directory of a run of `train.py`. Every request that cannot be trained is refused here."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ from mjxball.train.run_directory import (
 )
 from mjxball.xla import compile_small_loops_whole
 
-# What a run imports once it has begun: some of it after hours.
+# Packages that a run imports only after it has begun, some after hours.
 LATE_IMPORTS = ("tensorboardX", "orbax.checkpoint", "mujoco", "scipy", "matplotlib", "jinja2")
 
 
 def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
-    """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
-    measured = cli.read_plant(options.plant).preset if options.plant else None
-    name, seed = options.preset or measured or "transport", options.seed or 0
+    """(configuration, origin, directory) of a new run. Raises InputError for a request that cannot be trained."""
+    plant_preset = cli.read_plant(options.plant).preset if options.plant else None
+    name, seed = options.preset or plant_preset or "transport", options.seed or 0
     _refuse_settings_of_others(options)
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
-    called = options.env.rpartition(":")[2] if options.env else name
-    out = output_directory(options.out or Path("runs") / f"{called}-{time.strftime('%Y%m%d-%H%M%S')}")
+    stem = options.env.rpartition(":")[2] if options.env else name
+    out = output_directory(options.out or Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name) is not None}
-    if extensions.get("algorithm") == "sac":  # the default, of which nothing is to be checked
+    if extensions.get("algorithm") == "sac":  # the default, which needs no check
         del extensions["algorithm"]
     physics = options.physics or "mjx"
     if extensions:
@@ -81,7 +81,7 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
 
 
 def check_packages() -> None:
-    """Raise ModuleNotFoundError if a package is missing of which a run would know late."""
+    """Raise ModuleNotFoundError if one of `LATE_IMPORTS` is not installed, before training starts."""
     for name in LATE_IMPORTS:
         if importlib.util.find_spec(name) is None:
             package = name.partition(".")[0]
@@ -90,9 +90,9 @@ def check_packages() -> None:
 
 @contextlib.contextmanager
 def emptied_unless_begun(out: Path, errors: type[Exception] | tuple[()]) -> Iterator[Callable[[], None]]:
-    """Gives what is to be called when training begins; one of `errors` before that leaves nothing in the new `out`.
+    """Empty the new `out` if one of `errors` is raised before the function that this yields is called.
 
-    The same command can then be given again, when what it lacked is there.
+    Training calls it when it begins. After an earlier error the same command can be given again.
     """
     begun = threading.Event()
     try:
@@ -105,16 +105,16 @@ def emptied_unless_begun(out: Path, errors: type[Exception] | tuple[()]) -> Iter
 
 
 def output_directory(out: Path) -> Path:
-    """A new directory at `out`, or why there cannot be one: somebody trains there, first."""
+    """`out`, if it can be made or is empty but for a lock. Raises InputError otherwise, first if a run holds it."""
     try:
         return cli.output_directory(out, but=(LOCK,))
     except InputError:
-        check_free(out)  # whoever holds it is the better reason
+        check_free(out)  # that another run holds it is the more helpful error
         raise
 
 
 def _start_from(options: argparse.Namespace, settings: config.Config, members: int) -> Any:
-    """Which policy file the run, or each of `members`, starts from, see `run_directory.start_policy`."""
+    """The policy file (as in `run_directory.start_policy`) that the run starts from, or a list, one per member."""
     if (options.algorithm or "sac") != "gradient" or options.env:
         raise InputError(
             "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
@@ -130,6 +130,7 @@ def _start_from(options: argparse.Namespace, settings: config.Config, members: i
 
 
 def _start(path: Path, settings: config.Config) -> dict[str, str]:
+    """Path and hash of a policy file to start from. Raises InputError unless its layers are those of `settings`."""
     start = {"policy": str(path), "sha256": file_hash(path)}
     sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
     if sizes != list(settings.gradient.policy_layers):
@@ -145,7 +146,7 @@ def _digest(names: dict[str, str]) -> str | None:
 
 
 def _refuse_settings_of_others(options: argparse.Namespace) -> None:
-    """Refuse a setting of an algorithm of ours that is not the one which trains."""
+    """Raise InputError for a setting of a built-in algorithm other than the one that trains."""
     used = options.algorithm or "sac"
     given = [name.removeprefix("config:") for name, value in vars(options).items() if value and "config:" in name]
     for path in given:
@@ -156,13 +157,13 @@ def _refuse_settings_of_others(options: argparse.Namespace) -> None:
             )
 
 
-def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None, meeting: bool) -> str:
-    """The physics engine to train on; refuses what cannot be found or does not fit, before anything is written."""
+def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None, distributed: bool) -> str:
+    """The physics engine to train on. Raises InputError for an extension that is not found or does not fit."""
     from mjxball.train.extensions import Extensions, make_env, resolve
 
     extensions = resolve(Extensions(**names))
     _choose_processor(extensions.algorithm)
-    if not meeting:
+    if not distributed:
         wake_devices()
     engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
     physics = wanted or engines[0]
@@ -170,7 +171,7 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
         raise InputError(
             f"--algorithm {names['algorithm']} cannot train on --physics {physics}; it can on {', '.join(engines)}"
         )
-    if not meeting:  # else the processes meet before anything asks for devices, and training makes the same check
+    if not distributed:  # the processes connect before any of them uses a device; training repeats this check
         make_env(extensions, settings, physics)
     missing = [name for name in ("init", "collect", "update", "policy") if not hasattr(extensions.algorithm, name)]
     if extensions.algorithm is not None and missing:
@@ -181,9 +182,9 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
 
 
 def _choose_processor(algorithm: Any) -> None:
-    """Train on the CPU, its small loops compiled whole, what is done there before a GPU has compiled it.
+    """Select the CPU, with small loops compiled whole, for an algorithm that prefers it (`Algorithm`).
 
-    Where JAX_PLATFORMS says otherwise it stays so.
+    JAX_PLATFORMS, if set, takes precedence.
     """
     import jax
 
@@ -196,7 +197,7 @@ def _choose_processor(algorithm: Any) -> None:
 
 
 def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
-    """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
+    """(configuration, origin) of the `run` to continue. Raises InputError if another version of the program made it."""
     from mjxball.train.run_directory import read_config
 
     settings, origin = read_config(run)
@@ -214,10 +215,10 @@ def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
 
 
 def refuse_beside(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
-    """InputError that begins with `why` if something is given that makes a new run, `but` those."""
+    """Raise InputError, which begins with `why`, for options of a new run other than `but`."""
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
-    given += [f"--{name.replace('_', '-')}" for name in own if name not in but and getattr(options, name) is not None]
+    names = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
+    given += [f"--{name.replace('_', '-')}" for name in names if name not in but and getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:
         raise InputError(f"{why}; drop {', '.join(given)}")
@@ -225,9 +226,9 @@ def refuse_beside(options: argparse.Namespace, why: str, but: tuple[str, ...]) -
 
 @functools.cache
 def wake_devices() -> None:
-    """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow.
+    """Start the accelerator's runtime (2 s on a GPU) in a thread, in parallel to the imports that follow.
 
-    Whatever ends the process waits for the thread: one that Python stops inside XLA aborts it.
+    The thread is no daemon: if Python stopped it inside XLA, the process would abort.
     """
     import jax  # here: two threads must not both import it
 
@@ -235,5 +236,5 @@ def wake_devices() -> None:
 
 
 def _first_kernel(xp: Any) -> None:
-    with contextlib.suppress(RuntimeError, AssertionError):  # without a device; who needs one says so
+    with contextlib.suppress(RuntimeError, AssertionError):  # no device; the code that needs one reports it
         xp.zeros(1).block_until_ready()

@@ -1,4 +1,4 @@
-"""What `eval.py` flies: the plant and the scenarios that its flags ask for."""
+"""Plant and scenarios from the flags of `eval.py fly`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SCENARIO_FLAGS = (
 
 
 def setup_of(options: argparse.Namespace) -> config.Config:
-    """The paper's plant and laws, or those of `--plant`, with the motion of the CG that is asked for."""
+    """Configuration of the paper, or of `--plant`, with the attitude loops and the CG motion of the flags."""
     setup = cli.plant_setup(options.plant)
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency
@@ -41,7 +41,7 @@ def setup_of(options: argparse.Namespace) -> config.Config:
 
 
 def _refuse_two_motions(options: argparse.Namespace) -> None:
-    """The CG moves in one way: as a waveform, as a rolling ball, or as a sine of some speed and amplitude."""
+    """Raise InputError if flags of two CG motions are given: waveform, rolling ball, sine."""
     ways = {"waveform": "waveform", "rolling": "rolling", "omega": "sine", "amplitude": "sine"}
     given = {name: way for name, way in ways.items() if getattr(options, name) is not None}
     if len(set(given.values())) > 1:
@@ -51,7 +51,7 @@ def _refuse_two_motions(options: argparse.Namespace) -> None:
 
 
 def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
-    """On the paper's plant, or on that of `--plant`."""
+    """Scenarios on the paper's plant, or on that of `--plant`: standard ones unless flags or followers are given."""
     given = _given(options)
     if options.plant and not given:
         return standard_scenarios(setup)
@@ -63,7 +63,7 @@ def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[
 
 
 def native_scenarios(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
-    """The standard scenarios of a Crazyflies' plant, or the first one changed as the flags say."""
+    """Scenarios on a plant of Crazyflies: standard ones, or the first one changed by the flags."""
     standard = standard_scenarios(setup)
     if not _given(options):
         return standard[:1] if options.policies or options.followers else standard
@@ -77,8 +77,8 @@ def _given(options: argparse.Namespace) -> bool:
 
 
 def _asked(options: argparse.Namespace, setup: config.Config, reference: Scenario, **common: Any) -> Sequence[Scenario]:
-    """The cross product of the flags' lists; what no flag says is the reference's."""
-    made = cross(
+    """Cross product of the flags' lists, with the values of `reference` where no flag is given."""
+    scenarios = cross(
         options.omega or [reference.omega],
         options.amplitude or [reference.amplitude],
         options.mass or [reference.mass],
@@ -90,10 +90,11 @@ def _asked(options: argparse.Namespace, setup: config.Config, reference: Scenari
     )
     for mass in options.mass or []:
         config.check_lift(setup, mass)
-    return tuple(check_scenario(setup, scenario) for scenario in made)
+    return tuple(check_scenario(setup, scenario) for scenario in scenarios)
 
 
 def _mass_change(text: str) -> tuple[float, float]:
+    """(time [s], added mass [kg]) from `TIME:KG`."""
     try:
         time, mass = map(float, text.split(":"))
     except ValueError:

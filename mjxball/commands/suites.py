@@ -11,15 +11,7 @@ from mjxball.baselines import SUITE_BASELINES
 from mjxball.bench.report import write_report
 from mjxball.bench.scores import run_benchmark, text_table
 from mjxball.bench.suites import BY_NAME, list_suites
-from mjxball.commands.followers import (
-    add_flight,
-    add_followers,
-    add_policies,
-    clock,
-    load,
-    named,
-    refuse_same_names,
-)
+from mjxball.commands.followers import add_flight, add_followers, add_policies, clock, load, named, refuse_same_names
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import group_by_plant
@@ -28,7 +20,7 @@ from mjxball.train.run_directory import versions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Of `eval.py suites`."""
+    """Add the arguments of `eval.py suites`."""
     add_policies(parser)
     add_followers(parser)
     about = "suites to fly (default all), see --list"
@@ -41,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, command: str) -> int:
-    """Fly and compare, with progress on stderr; return the exit code."""
+    """Fly the suites and print scores, with progress on stderr; return the exit code."""
     if options.list:
         print(list_suites())
         return 0
@@ -51,19 +43,19 @@ def run(options: argparse.Namespace, command: str) -> int:
         cli.output_directory(options.out)
     if options.json:
         cli.output_file(options.json, ".json")
-    setup, chosen, who = preset("paper"), [BY_NAME[name] for name in dict.fromkeys(options.only)], named(options)
-    paths, others = (who.paths, []) if options.force else group_by_plant(who.paths)
-    if others and who.asked:
+    setup, suites, selected = preset("paper"), [BY_NAME[name] for name in dict.fromkeys(options.only)], named(options)
+    paths, others = (selected.paths, []) if options.force else group_by_plant(selected.paths)
+    if others and selected.asked:
         raise InputError(f"suites fly the paper's plant, and {others[0][1][0]} was made for another")
-    longest = max(variant.scenario.seconds for suite in chosen for variant in suite.variants)
+    longest = max(variant.scenario.seconds for suite in suites for variant in suite.variants)
     policies = load(paths, lambda path: setup, options.force, seconds=longest)
-    followers = [*who.made(setup, SUITE_BASELINES), *policies]
+    followers = [*selected.made(setup, SUITE_BASELINES), *policies]
     refuse_same_names([follower.name for follower in followers])
-    scores = run_benchmark(setup, followers, chosen, options.num_seeds, options.physics, clock())
-    print(text_table(scores, chosen))
+    scores = run_benchmark(setup, followers, suites, options.num_seeds, options.physics, clock())
+    print(text_table(scores, suites))
     if options.json:
         write_whole(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
-        write_report(options.out, setup.plant, scores, chosen, policies, command, versions())
+        write_report(options.out, setup.plant, scores, suites, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")
     return 0

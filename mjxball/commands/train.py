@@ -35,13 +35,10 @@ from mjxball.policy.file import policy_path
 from mjxball.terminal import say, warn
 from mjxball.train import processes, shares
 from mjxball.train.curves import draw_training
-from mjxball.train.run_directory import (
-    CHECKPOINTS,
-    POLICY,
-)
+from mjxball.train.run_directory import CHECKPOINTS, POLICY
 from mjxball.xla import check_address_space, enable_compilation_cache
 
-# What `--help` shows of the settings; `--help all` has the rest.
+# Settings that `--help` lists; `--help all` lists every one.
 COMMON = (
     *("scenario.cg_speed", "scenario.cg_amplitude", "scenario.object_mass", "scenario.noise", "scenario.delay"),
     *("follower.action_scale_tilt", "follower.recurrent_units", "reward.kind"),
@@ -52,7 +49,7 @@ SECTIONS = tuple(dict.fromkeys(path.partition(".")[0] for path, _, _ in config.l
 
 
 def parser() -> cli.Parser:
-    """The argument parser; configuration flags are generated from `mjxball.config`."""
+    """Argument parser of `train.py`. Flags of settings are generated from `mjxball.config`."""
     result = cli.make_parser(
         "train.py",
         usage="%(prog)s [PRESET] [FLAG ...]",
@@ -79,11 +76,11 @@ def parser() -> cli.Parser:
     run.add_argument("--physics", choices=TRAINING_ENGINES, metavar="ENGINE", help=about)
     about = f"{', '.join(config.PLANTS)}, or a rig in TOML, JSON, MJCF or URDF (docs/howto/own-rig.md)"
     run.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
-    own = result.add_argument_group("in place of ours")
-    own.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
-    own.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state)")
+    extensions = result.add_argument_group("in place of ours")
+    extensions.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
+    extensions.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state)")
     about = "start(name, settings), which returns log(row) for every row of metrics.csv: docs/howto/trackers.md"
-    own.add_argument("--tracker", metavar="MODULE:FUNCTION", help=about)
+    extensions.add_argument("--tracker", metavar="MODULE:FUNCTION", help=about)
     parts = result.add_argument_group("a population in parts")
     about = "train the I-th of N equal parts of --num-seeds and --sweep, I = 0 .. N - 1"
     parts.add_argument("--share", metavar="I/N", help=about)
@@ -99,7 +96,10 @@ def parser() -> cli.Parser:
 
 
 def _describe(parser: cli.Parser, given: argparse.Namespace, topic: str | None) -> set[str] | None:
-    """See `cli.Help`: the topic is `all`, a section of the configuration or a preset, whose values are shown."""
+    """Flags that `--help TOPIC` lists, None for all (see `cli.Help`).
+
+    The topic is `all`, a section of the configuration, or a preset, whose values are then the defaults shown.
+    """
     known = ("all", *SECTIONS, *config.PRESETS)
     if topic is not None and topic not in known:
         raise InputError(f"no help on {topic!r}; there is --help {', '.join(known)}")
@@ -107,9 +107,9 @@ def _describe(parser: cli.Parser, given: argparse.Namespace, topic: str | None) 
     plant = cli.read_plant(given.plant) if given.plant else None
     name = name or (plant.preset if plant else None) or "transport"
     cli.show_defaults(parser, config.with_plant(config.preset(name), given.plant, {}))
-    flown = f" on the plant {given.plant}" if given.plant else ""
+    on_plant = f" on the plant {given.plant}" if given.plant else ""
     parser.epilog = (
-        f"Defaults of settings are those of the preset {name}{flown}; tuples are comma-separated. "
+        f"Defaults of settings are those of the preset {name}{on_plant}; tuples are comma-separated. "
         f"All settings: --help all, or of one section: --help {', '.join(SECTIONS)}. {parser.epilog}"
     )
     if topic == "all":
@@ -128,12 +128,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _train(options: argparse.Namespace, command: str) -> int:
-    meeting, started = _meeting(options), time.monotonic()
+    rendezvous, started = _rendezvous(options), time.monotonic()
     check_packages()
     if options.gather is not None:
         return _gather(options)
     check_address_space()
-    # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
+    # Preallocating three quarters of a large GPU's memory takes 1.6 s. Allocation on demand trains as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if options.resume is not None:
         refuse_beside(options, "--resume continues with the run's own configuration", ())
@@ -142,36 +142,37 @@ def _train(options: argparse.Namespace, command: str) -> int:
         settings, origin, out = new_run(options, command)
     enable_compilation_cache()
     resume = options.resume is not None
-    check = (lambda: None) if resume else (lambda: output_directory(out))  # what the lock's holder may have left there
+    # Checked again under the lock: another run may have written there since.
+    check = (lambda: None) if resume else (lambda: output_directory(out))
     from mjxball.train.compilation import jax_setting
 
-    # Float32 also where JAX_ENABLE_X64 is set: a run is the same then, and can be resumed.
+    # Float32 even if JAX_ENABLE_X64 is set, so that a run is reproducible and can be resumed.
     with contextlib.ExitStack() as hold, jax_setting("jax_enable_x64", False):
-        if meeting:
-            processes.join(meeting)
-        with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
-            hold.enter_context(processes.holding(out, meeting is not None, check))
-            writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
-            # Of several processes one that is lost is no refusal: they go on by --resume.
-            undone = () if resume or not writes else InputError if meeting else Exception
+        if rendezvous:
+            processes.join(rendezvous)
+        with processes.exit_when_a_process_is_lost(f"--resume {out}") if rendezvous else contextlib.nullcontext():
+            hold.enter_context(processes.holding(out, rendezvous is not None, check))
+            writes = not rendezvous or processes.is_writer()  # `is_writer` waits until the devices have started
+            # A run of several processes of which one is lost is continued with --resume, so its files stay.
+            undone = () if resume or not writes else InputError if rendezvous else Exception
             begun = hold.enter_context(emptied_unless_begun(out, undone))
-            with ThreadPoolExecutor(1) as beside:
+            with ThreadPoolExecutor(1) as pool:
 
                 def prepare() -> None:
                     begun()
                     if writes and options.plant:
                         warn(rig_line(settings))
                     if writes and is_evaluated(origin):
-                        beside.submit(compile_ahead, settings, origin["physics"])
+                        pool.submit(compile_ahead, settings, origin["physics"])
 
                 code = _run(settings, origin, out, resume, prepare, options.tracker)
-            if meeting:
+            if rendezvous:
                 processes.leave()
         return _finish(settings, origin, out, code, started) if writes else code or 0
 
 
 def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: int | None, started: float) -> int:
-    """Print and draw what came of a training that ended with `code`, see `_run`; return the exit code."""
+    """Report a training that ended with `code` (see `_run`) and evaluate its policy; return the exit code."""
     if code is None and (out / "eval" / RESULTS).exists():
         print(f"{out} was finished and evaluated before; nothing is left to do")
         return 0
@@ -193,15 +194,15 @@ def _run(
     origin: dict[str, Any],
     out: Path,
     resume: bool,
-    beside: Callable[[], None],
+    on_start: Callable[[], None],
     tracker: str | None = None,
 ) -> int | None:
     """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train.
 
-    `beside` is called when everything is compiled and the device begins to train.
+    `on_start` is called when everything is compiled and the device begins to train.
     """
     wake_devices()
-    # The algorithm's libraries are imported meanwhile, before anything asks for devices.
+    # The algorithm's libraries are imported while the devices start.
     from mjxball.train import loop, requirements
     from mjxball.train.extensions import find
     from mjxball.train.run import Run
@@ -209,7 +210,7 @@ def _run(
     algorithm = (origin.get("extensions") or {}).get("algorithm") or "sac"
     find(algorithm, "--algorithm")
     start = None if tracker is None else find(tracker, "--tracker")
-    if algorithm in ALGORITHMS:  # of others nobody knows what they take
+    if algorithm in ALGORITHMS:  # the memory that other algorithms need is unknown
         requirements.check(settings, algorithm, origin["seeds"])
     state = None
     if resume:
@@ -222,16 +223,17 @@ def _run(
         if steps >= total:
             return None
     try:
-        return 0 if loop.train(Run(settings, out, origin, state, start), beside) else 130
+        return 0 if loop.train(Run(settings, out, origin, state, start), on_start) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
-            kept = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))
-            where = f"the last good policy and checkpoint are in {out}" if kept else "no checkpoint came before"
+            saved = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))
+            where = f"the last good policy and checkpoint are in {out}" if saved else "no checkpoint came before"
             warn(f"training diverged: {error}; {where}")
         return 1
 
 
-def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
+def _rendezvous(options: argparse.Namespace) -> processes.Rendezvous | None:
+    """How the processes of a distributed run find each other; None for a run of one process."""
     given = (options.coordinator, options.processes, options.process)
     if options.distributed:
         return processes.Rendezvous(*given)
@@ -241,7 +243,7 @@ def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
 
 
 def _gather(options: argparse.Namespace) -> int:
-    """Bring the parts of a population together and compare its members, as a run of all of them would."""
+    """Join the runs of a population's parts and compare its members, as one run of all would do."""
     refuse_beside(options, "--gather takes runs as they are", ("out",))
     if options.resume or options.distributed or options.out is None:
         raise InputError("--gather RUN ... needs --out DIR, a new directory, and neither --resume nor --distributed")

@@ -1,8 +1,8 @@
 """Gymnasium environments: `import mjxball.gym`, then `gymnasium.make("mjxball/Transport-v0")`.
 
 Every preset of a pair is registered. `gymnasium.make` gives one world on C MuJoCo, `gymnasium.make_vec(...,
-num_envs=N, vectorization_mode="vector_entry_point")` N worlds on MJX. Observation, reward, endings and the worlds that
-are drawn are those of `mjxball.env`. Teams, whose followers are several agents, are
+num_envs=N, vectorization_mode="vector_entry_point")` N worlds on MJX. Observation, reward, terminations and the reset
+distribution are those of `mjxball.env`. Teams, whose followers are several agents, are
 `mjxball.gym.parallel.FollowersParallelEnv`, for PettingZoo.
 """
 
@@ -19,7 +19,7 @@ __all__ = ["environment_id"]
 
 
 def environment_id(preset: str) -> str:
-    """Gymnasium's name of `preset`."""
+    """Gymnasium's id of the environment of `preset`."""
     return f"mjxball/{preset.capitalize()}-v0"
 
 

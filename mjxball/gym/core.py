@@ -1,4 +1,4 @@
-"""The core of the environments: worlds that begin, step and end. The other files add what each interface asks for."""
+"""Core of the environments: worlds that reset, step and end. The other files adapt them to each interface."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax._src import xla_bridge  # whether a device has been made: nothing public says it
+from jax._src import xla_bridge  # no public function tells whether a backend is initialised
 
 from mjxball import config as configs
 from mjxball.arrays import Array, real_numbers
@@ -29,11 +29,11 @@ from mjxball.xla import enable_compilation_cache
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 PICTURE = (360, 480)  # height, width of a rendered frame
 THREADS = Path("/proc/self/task")
-_home: dict[str, int] = {}  # number of the process in which JAX runs for the environments
+_home: dict[str, int] = {}  # id of the process in which JAX runs for the environments
 
 
 def in_float32(method: Callable[..., Any]) -> Callable[..., Any]:
-    """`method` with arrays of 32 bits, also where JAX_ENABLE_X64 is set: a seed draws the same worlds then."""
+    """`method` with 32-bit arrays even if JAX_ENABLE_X64 is set, so that a seed gives the same worlds."""
 
     @functools.wraps(method)
     def call(*arguments: Any, **named: Any) -> Any:
@@ -46,15 +46,15 @@ def in_float32(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def check_process() -> None:
-    """Raise InputError in a process that was forked from one in which JAX has run: it would hang there.
+    """Raise InputError in a process that was forked from one in which JAX has run: JAX would hang.
 
-    Its threads are not in the copy: where JAX has a device and the process a single thread, it is a copy.
+    A fork does not copy threads, so a process with an initialised backend and a single thread is a fork.
     """
     process = os.getpid()
     if _home.get("process") == process:
         return
-    copied = xla_bridge.backends_are_initialized() and THREADS.is_dir() and len(list(THREADS.iterdir())) == 1
-    if copied or _home.setdefault("process", process) != process:
+    forked = xla_bridge.backends_are_initialized() and THREADS.is_dir() and len(list(THREADS.iterdir())) == 1
+    if forked or _home.setdefault("process", process) != process:
         raise InputError(
             "this process was forked from one in which JAX runs, where it would wait for ever; start it with spawn, "
             "such as gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
@@ -62,16 +62,16 @@ def check_process() -> None:
 
 
 class Program(NamedTuple):
-    """Functions of one world or of N at once, each compiled at its first call."""
+    """Functions of one world or of N at once, each compiled at its first call. A chain is a key split at each reset."""
 
     env: TransportEnv
-    chain: Any  # seed, as of `seed_number` -> chain of keys
+    chain: Any  # seed, as of `seed_number` -> chain
     start: Any  # chain -> (chain, State)
     step: Any  # (State, action) -> State
     commands: Any  # (State, action (3,)) -> (commands (2, 3), Load)
-    arrive: Any  # (State, action (3,), PlantState that another engine came to) -> State
-    next_step: Any  # (chain, State, action) -> (chain, State): an ended world starts anew instead of stepping
-    same_step: Any  # likewise -> (chain, State as stepped, State: of an ended world that of its next episode)
+    arrive: Any  # (State, action (3,), PlantState after the step by another engine) -> State
+    next_step: Any  # (chain, State, action) -> (chain, State): an ended world is reset instead of stepped
+    same_step: Any  # the same -> (chain, State after the step, State after reset of ended worlds)
 
 
 @functools.lru_cache(maxsize=16)
@@ -100,14 +100,14 @@ def program(config: Config, physics: str, many: bool = False) -> Program:
     return Program(env, *(jax.jit(jax.vmap(part) if many else part) for part in parts))
 
 
-def _where(ended: Array, fresh: Any, going: Any) -> Any:
-    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, going)
+def _where(ended: Array, fresh: Any, running: Any) -> Any:
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, running)
 
 
 class World:
-    """One world, its state, and the chain of keys that its episodes are drawn from: in float32 on the CPU.
+    """One world, its state, and the chain of keys from which its episodes are sampled, in float32 on the CPU.
 
-    It is pickled with its state, and compiled again where it arrives. `render_mode` is None or rgb_array.
+    Pickling keeps the state; functions are compiled again. `render_mode` is None or rgb_array.
     """
 
     _many, _place = False, staticmethod(on_the_host)
@@ -127,17 +127,17 @@ class World:
             self.program = program(self._config, self._physics, self._many)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what `_compile` makes."""
+        """All attributes but those that `_compile` sets."""
         return {name: value for name, value in vars(self).items() if name not in ("program", "_scene", "_move")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """See `__getstate__`."""
+        """Restore the attributes and compile."""
         vars(self).update(state)
         self._compile()
 
     @in_float32
     def reset(self, seed: int | Sequence[int] | None) -> None:
-        """The next episode of the chain, or the first one of the chain of `seed`, as of `seed_number`."""
+        """Start the next episode of the chain, or the first one of a new chain from `seed` (`seed_number`)."""
         check_process()
         with self._place():
             if seed is not None:
@@ -146,12 +146,12 @@ class World:
         if self._render_mode is not None:
             world = self.state.pipeline_state
             self._look_at = (np.asarray(world.goal, float) + np.asarray(world.plant.position)) / 2
-        if self._config.scenario.team_sizes:  # a picture shows as many drones as there are
+        if self._config.scenario.team_sizes:  # the scene depends on the number of drones
             self.close()
 
     @in_float32
     def step(self, action: Array) -> Any:
-        """The `State` after `action` has been held for one control period."""
+        """The `State` after holding `action` for one control period."""
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         check_process()
@@ -163,11 +163,11 @@ class World:
         return self.state
 
     def seen(self, state: Any = None) -> np.ndarray:
-        """What the followers see (..., n) in `state`, by default now."""
+        """The policy's observation (..., n) in `state`, by default the current one."""
         return np.array(np.asarray((state or self.state).obs)[..., : self.program.env.policy_input_size])
 
     def picture(self) -> np.ndarray | None:
-        """The team and its goal as pixels (height, width, 3) uint8, or None without a render mode."""
+        """Image (height, width, 3) uint8 of the team and its goal, or None without a render mode."""
         if self._render_mode is None or self.state is None:
             gymnasium.logger.warn("render needs render_mode='rgb_array' and a reset before it")
             return None
@@ -177,8 +177,8 @@ class World:
             from mjxball.scene import Scene
 
             size = int(present(world.rig, plant.followers).sum()) + 1
-            drawn = ring(plant, size) if self._config.scenario.team_sizes else plant
-            self._scene = Scene(drawn, goal, PICTURE, self._look_at)
+            team = ring(plant, size) if self._config.scenario.team_sizes else plant
+            self._scene = Scene(team, goal, PICTURE, self._look_at)
         self._scene.move_goal(goal, self._look_at)
         return self._scene.picture(*pose_of(self._config, world))
 
@@ -194,7 +194,7 @@ class HostWorld(World):
 
     def __init__(self, config: Config, engine: str, render_mode: str | None = None):
         self._engine = engine
-        super().__init__(config, "newton-euler", render_mode)  # whose own physics is never called
+        super().__init__(config, "newton-euler", render_mode)  # this engine is never called
 
     def _compile(self) -> None:
         super()._compile()
@@ -208,15 +208,15 @@ class HostWorld(World):
     def _step(self, action: Array) -> Any:
         commands, load = self.program.commands(self.state, action)
         plant = self._move(self._plant, np.asarray(commands, float)[None], _batch_of_one(load))
-        arrived = plant.each(lambda leaf: leaf[0].astype(np.float32))
-        self.state = self.program.arrive(self.state, action, arrived)
+        after = plant.each(lambda leaf: leaf[0].astype(np.float32))
+        self.state = self.program.arrive(self.state, action, after)
         if not self.state.metrics["diverged"]:
             self._plant = plant
         return self.state
 
 
 class Worlds(World):
-    """N worlds on JAX's default device, which start anew after an end: by the next step, or by the `same_step`."""
+    """N worlds on JAX's default device. An ended world is reset by the next step, or within the `same_step`."""
 
     _many, _place = True, staticmethod(contextlib.nullcontext)
 
@@ -233,54 +233,51 @@ class Worlds(World):
 
 
 def pose_of(config: Config, world: PipelineState) -> tuple[Array, Array, Array]:
-    """Position, quaternion and CG offset, as `mjxball.scene.Scene.picture` takes them."""
+    """(position, quaternion, CG offset), the arguments of `mjxball.scene.Scene.picture`."""
     offset = make_cg_offset(config)(_batch_of_one(world.plant), _batch_of_one(world.load))
     return world.plant.position, world.plant.quaternion, offset[0]
 
 
 def _batch_of_one(leaves: Any) -> Any:
-    """The named tuple `leaves` in float64 with a batch axis; what is absent stays absent."""
+    """The named tuple `leaves` in float64 with a batch axis; None stays None."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], leaves)
 
 
 def settings(preset: str, config: Config | None) -> Config:
-    """`config`, validated, or else the preset called `preset`; without a GRU: a trainer brings its own network."""
-    found = configs.preset(preset) if config is None else configs.validate(config)
-    return configs.replace(found, "follower.recurrent_units", 0)
+    """`config`, validated, or else the preset called `preset`, without a GRU: trainers have their own networks."""
+    valid = configs.preset(preset) if config is None else configs.validate(config)
+    return configs.replace(valid, "follower.recurrent_units", 0)
 
 
 def pair_settings(preset: str, config: Config | None) -> Config:
-    """`settings`; InputError for a team, whose followers are several agents."""
-    found = settings(preset, config)
-    if found.plant.count > 2:
-        followers = found.plant.count - 1
+    """`settings`. Raises InputError for a team, whose followers are several agents."""
+    pair = settings(preset, config)
+    if pair.plant.count > 2:
+        followers = pair.plant.count - 1
         raise InputError(
             f"this environment has one agent, and the plant {followers} followers; use mjxball.gym.parallel"
         )
-    return found
+    return pair
 
 
 def agents(config: Config) -> list[str]:
-    """Names of a team's followers, in the order of the plant's drones without the leader."""
+    """Names of a team's followers, in the order of the plant's drones."""
     return [f"follower_{number + 1}" for number in range(len(config.plant.followers))]
 
 
 def present(rig: Any, drones: Sequence[int]) -> Array:
-    """Whether each of `drones` (F) is of a world of `rig`: those that pad smaller teams have no mass."""
+    """(F,) whether each of `drones` exists in a world of `rig`: the padding of smaller teams has no mass."""
     return np.ones(len(drones), bool) if rig == () else rig.drone_mass[np.array(drones)] > 0
 
 
 def spaces(env: TransportEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Spaces of observation (n,) and action (3,): what the follower sees and remembers, and [-1, 1]."""
+    """Spaces of observation (n,), the policy's input, and action (3,) in [-1, 1]."""
     observations = gymnasium.spaces.Box(-np.inf, np.inf, (env.policy_input_size,), np.float32)
     return observations, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
 def checked_action(action: Array, shape: tuple[int, ...] | None) -> np.ndarray:
-    """`action` as float32, which the environment clips to the box [-1, 1].
-
-    Raises InputError unless it is finite and of `shape`, and of real numbers.
-    """
+    """`action` as float32, clipped to [-1, 1]. Raises InputError unless it is real, finite and of `shape`."""
     given = real_numbers(action, f"an action of shape {shape}")
     if given.shape != shape:
         found = f"of shape {given.shape}"
@@ -292,16 +289,16 @@ def checked_action(action: Array, shape: tuple[int, ...] | None) -> np.ndarray:
 
 
 def seed_number(random: np.random.Generator) -> int:
-    """The number that one world's keys come from, drawn from Gymnasium's generator."""
+    """A seed for one world's keys, sampled from Gymnasium's generator."""
     return int(random.integers(2**32))
 
 
 def ends_of(state: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(terminated, truncated): the object left d_term or the world diverged; the episode's time is over."""
+    """(terminated, truncated): the object left d_term or the world diverged; the time limit was reached."""
     truncated = np.asarray(state.info["truncation"]) > 0
     return (np.asarray(state.done) > 0) & ~truncated, truncated
 
 
 def info_of(state: Any) -> dict[str, Array]:
-    """What `info` holds of a state: |e_o| [m], the squared command errors, and whether the world has diverged."""
+    """Entries of `info`: |e_o| [m], mean squared command errors, and whether the world has diverged."""
     return {name: state.metrics[name] for name in ("error", "tilt_error", "vertical_error", "diverged")}

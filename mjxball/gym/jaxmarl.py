@@ -1,4 +1,4 @@
-"""The followers of a team as JaxMARL's `MultiAgentEnv`: agents follower_1, ..., follower_F, all inside JAX."""
+"""The followers of a team as JaxMARL's `MultiAgentEnv`: agents follower_1, ..., follower_F, entirely in JAX."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError("jaxmarl is not installed; pip install 'mjxball[jaxmarl]'", name="jaxmarl") from None
 from jaxmarl.environments.spaces import Box
 
-Each = dict[str, Array]  # agent -> its own
+Each = dict[str, Array]  # value by agent
 
 
 @flax.struct.dataclass
@@ -35,13 +35,13 @@ class FollowersState(base.State):  # type: ignore[name-defined]
 
 
 class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
-    """One world of `mjxball.env`: each follower sees (n,) float32 and acts (3,) in [-1, 1] in its own frame.
+    """One world of `mjxball.env`. Each follower observes (n,) float32 and acts (3,) in [-1, 1], in its own frame.
 
-    Agents, observations, rewards and ends are those of `FollowersParallelEnv`, for `jax.jit`, `vmap` and `scan`;
-    `step` begins the next episode by itself, with a world drawn from its key. `dones` of all agents are 1 together.
-    `info` holds for each agent what PettingZoo's does, and `truncation`: 1 if the episode's time was over. Where worlds
-    have teams of several sizes, an agent that is not there sees zeros, earns zeros and is done. `physics` is
-    newton-euler or mjx; `config` replaces the preset's.
+    Agents, observations, rewards and terminations are those of `FollowersParallelEnv`, for `jax.jit`, `vmap` and
+    `scan`. `step` resets an ended world, with an episode sampled with its key. All agents are done together. `info`
+    holds for each agent the entries of PettingZoo's and `truncation`, 1 at the time limit. If teams have several sizes,
+    an agent that does not exist observes zeros, has reward 0 and is done. `physics` is newton-euler or mjx; `config`
+    replaces the preset's.
     """
 
     def __init__(self, preset: str = "team", config: Config | None = None, physics: str = "newton-euler"):
@@ -54,7 +54,7 @@ class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
 
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: Array) -> tuple[Each, FollowersState]:
-        """A fresh world drawn from `config.scenario`."""
+        """A world sampled from `config.scenario`."""
         state = self._state(self._env.reset(key))
         return self.get_obs(state), state
 
@@ -76,17 +76,17 @@ class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
         return self.get_obs(moved), moved, rewards, dones, shared
 
     def get_obs(self, state: FollowersState) -> Each:
-        """What every agent sees (n,)."""
+        """Observation (n,) of every agent."""
         seen = jnp.reshape(state.world.obs, (self.num_agents, -1))[:, : self._env.policy_input_size]
         return self._each(jnp.where(self._there(state.world)[:, None], seen, 0.0))
 
     def get_avail_actions(self, state: FollowersState) -> Each:
-        """Each agent's (3,): all."""
+        """Available actions (3,) of every agent: all."""
         return self._each(jnp.ones((self.num_agents, ACTION_SIZE), bool))
 
     @property
     def agent_classes(self) -> dict[str, list[str]]:
-        """All are of one class."""
+        """Agents by class; all are of one."""
         return {"follower": self.agents}
 
     def _state(self, world: State) -> FollowersState:

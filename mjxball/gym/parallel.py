@@ -21,12 +21,12 @@ METADATA: dict[str, Any] = {**core.METADATA, "name": "mjxball_followers_v0"}
 
 
 class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
-    """One world of `mjxball.env` in float32: each follower sees (n,) float32 and acts (3,) in [-1, 1] in its own frame.
+    """One world of `mjxball.env`. Each follower observes (n,) float32 and acts (3,) in [-1, 1], in its own frame.
 
     All share the goal and end together: `terminated` means that the object left d_term or that the world diverged,
-    `truncated` that the episode's time is over. Where worlds have teams of several sizes (`scenario.team_sizes`), a
-    reset's `agents` are the first of `possible_agents`, as many as there are followers. `physics` is newton-euler or
-    mjx; `config` replaces the preset's.
+    `truncated` that the time limit was reached. If teams have several sizes (`scenario.team_sizes`), `agents` after a
+    reset are the first of `possible_agents`, as many as there are followers. `physics` is newton-euler or mjx, in
+    float32; `config` replaces the preset's.
     """
 
     metadata = METADATA
@@ -45,8 +45,8 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
         self.possible_agents = core.agents(self.config)
         self.agents: list[str] = []
         spaces = {agent: core.spaces(self._world.program.env) for agent in self.possible_agents}
-        self.observation_spaces = {agent: seen for agent, (seen, _) in spaces.items()}
-        self.action_spaces = {agent: acts for agent, (_, acts) in spaces.items()}
+        self.observation_spaces = {agent: observation for agent, (observation, _) in spaces.items()}
+        self.action_spaces = {agent: action for agent, (_, action) in spaces.items()}
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Space:
         """(n,) float32, the same for all."""
@@ -59,12 +59,12 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """A fresh world drawn from `config.scenario`; seeds as of `FollowerEnv`, `options` are not used."""
-        anew = seed is not None or self._world.state is None
-        self._world.reset(core.seed_number(np_random(seed)[0]) if anew else None)
+        """A world sampled from `config.scenario`; seeds as in `FollowerEnv`, `options` are not used."""
+        reseed = seed is not None or self._world.state is None
+        self._world.reset(core.seed_number(np_random(seed)[0]) if reseed else None)
         rig = jax.tree.map(np.asarray, self._world.state.pipeline_state.rig)
         self.agents = self.possible_agents[: core.present(rig, self.config.plant.followers).sum()]
-        return self._seen(), {agent: {} for agent in self.agents}
+        return self._observations(), {agent: {} for agent in self.agents}
 
     def step(
         self, actions: dict[str, np.ndarray]
@@ -75,30 +75,30 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
         if set(actions) != set(self.agents):
             raise ValueError(f"actions must be for {', '.join(self.agents)}, not for {', '.join(actions) or 'nobody'}")
         given = np.zeros((len(self.possible_agents), 3), np.float32)
-        for number, agent in enumerate(self.agents):
-            given[number] = core.checked_action(actions[agent], self.action_spaces[agent].shape)
+        for k, agent in enumerate(self.agents):
+            given[k] = core.checked_action(actions[agent], self.action_spaces[agent].shape)
         state, agents = self._world.step(given if len(given) > 1 else given[0]), self.agents
         terminated, truncated = map(bool, core.ends_of(state))
         info = {name: float(value) for name, value in core.info_of(state).items()}
-        rewards, seen = np.reshape(np.asarray(state.reward), -1), self._seen()
+        rewards, observations = np.reshape(np.asarray(state.reward), -1), self._observations()
         if terminated or truncated:
             self.agents = []
         return (
-            seen,
-            {agent: float(rewards[number]) for number, agent in enumerate(agents)},
+            observations,
+            {agent: float(rewards[k]) for k, agent in enumerate(agents)},
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             {agent: dict(info) for agent in agents},
         )
 
     def render(self) -> np.ndarray | None:
-        """The team and its goal as pixels (height, width, 3) uint8, or None without a render mode."""
+        """Image (height, width, 3) uint8 of the team and its goal, or None without a render mode."""
         return self._world.picture()
 
     def close(self) -> None:
         """Free the renderer."""
         self._world.close()
 
-    def _seen(self) -> dict[str, np.ndarray]:
-        seen = np.atleast_2d(self._world.seen())
-        return {agent: seen[number].copy() for number, agent in enumerate(self.agents)}
+    def _observations(self) -> dict[str, np.ndarray]:
+        observations = np.atleast_2d(self._world.seen())
+        return {agent: observations[k].copy() for k, agent in enumerate(self.agents)}

@@ -1,6 +1,6 @@
-"""The environment for MuJoCo Playground's wrappers and trainers, which want `state.data` for Brax's `pipeline_state`.
+"""The environment for MuJoCo Playground's wrappers and trainers, which read `state.data`, not Brax's `pipeline_state`.
 
-Playground itself is not needed to import this.
+Playground itself need not be installed.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ class PlaygroundState:
     """The fields of Playground's `State`; `data` is this project's `PipelineState` instead of an `mjx.Data`."""
 
     data: PipelineState
-    obs: Array  # (n,) the networks' input, critics' part included
+    obs: Array  # (n,) the networks' input, with privileged information of critics
     reward: Array  # ()
-    done: Array  # () 1 at an end
+    done: Array  # () 1 at the end of an episode
     metrics: dict[str, Array]
     info: dict[str, Any]
 
 
 class PlaygroundEnv:
-    """`TransportEnv` with the attributes of Playground's `MjxEnv`. For its `wrap_for_brax_training`.
+    """`TransportEnv` with the attributes of Playground's `MjxEnv`, for its `wrap_for_brax_training`.
 
-    Worlds are randomised by every reset, so Playground's `randomization_fn` has nothing to do here; use
-    `full_reset=True`, or every episode of a world repeats its first one.
+    Every reset randomises the world, so `randomization_fn` is not needed. Use `full_reset=True`, or every episode of a
+    world repeats its first one.
     """
 
     def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
@@ -59,7 +59,7 @@ class PlaygroundEnv:
 
     @property
     def action_size(self) -> int:
-        """Roll, pitch, vertical acceleration."""
+        """Length of an action: roll, pitch, vertical acceleration."""
         return self._pair.action_size
 
     @property
@@ -84,7 +84,7 @@ class PlaygroundEnv:
 
     @property
     def xml_path(self) -> str:
-        """Empty: the model is built, see `python -m mjxball.assembly`."""
+        """Empty: the model has no file (see `python -m mjxball.assembly`)."""
         return ""
 
     @functools.cached_property
@@ -102,7 +102,7 @@ class PlaygroundEnv:
     def render(
         self, trajectory: Sequence[PlaygroundState], height: int = 240, width: int = 320, *unused: Any
     ) -> list[np.ndarray]:
-        """Pictures (height, width, 3) of unbatched states; Playground's camera and scene options are not used."""
+        """Images (height, width, 3) of unbatched states; Playground's camera and scene options are not used."""
         from mjxball.scene import Scene
 
         goal = np.asarray(trajectory[0].data.goal, float)

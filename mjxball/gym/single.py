@@ -1,4 +1,4 @@
-"""One world as a `gymnasium.Env`, on C MuJoCo where that knows what the worlds are made of."""
+"""One world as a `gymnasium.Env`, by default on C MuJoCo where it can model the world."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from mjxball.gym import core
 
 
 def engine_of(config: Config, physics: str | None) -> str:
-    """`physics`; by default C MuJoCo, or the closed form where worlds differ by inertia without mass.
+    """`physics`; by default C MuJoCo, or newton-euler if `scenario.inertia_scale` adds inertia without mass.
 
-    Such inertia is what C MuJoCo lacks: raises InputError if it is asked for there.
+    C MuJoCo cannot model that. Raises InputError if it is requested then.
     """
     massless = config.scenario.inertia_scale != (1.0, 1.0)
     if massless and physics == "mujoco":
@@ -27,8 +27,8 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """The follower's task: observation (n,) float32, action (3,) in [-1, 1], both as in `mjxball.env`.
 
     `physics` is mujoco, newton-euler or mjx, in float64 (default: `engine_of`); `config` replaces the preset's.
-    `terminated` means that the object left d_term or that the world diverged, `truncated` that the episode's time
-    is over: bootstrap there.
+    `terminated` means that the object left d_term or that the world diverged, `truncated` that the time limit was
+    reached, where learners should bootstrap.
     """
 
     metadata = core.METADATA
@@ -47,10 +47,10 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = core.spaces(self._world.program.env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """A fresh world drawn from `config.scenario`; `options` are not used."""
+        """A world sampled from `config.scenario`; `options` are not used."""
         super().reset(seed=seed)
-        anew = seed is not None or self._world.state is None
-        self._world.reset(core.seed_number(self.np_random) if anew else None)
+        reseed = seed is not None or self._world.state is None
+        self._world.reset(core.seed_number(self.np_random) if reseed else None)
         return self._world.seen(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -61,7 +61,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._world.seen(), float(state.reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The pair and its goal as pixels (height, width, 3) uint8, or None without a render mode."""
+        """Image (height, width, 3) uint8 of the pair and its goal, or None without a render mode."""
         return self._world.picture()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Many worlds as a `gymnasium.vector.VectorEnv`, in one compiled program on MJX or the closed form."""
+"""Many worlds as a `gymnasium.vector.VectorEnv`, in one compiled program on MJX or newton-euler."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ METADATA: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.
 class FollowerVectorEnv(gymnasium.vector.VectorEnv):
     """N worlds of the follower's task; world i is `FollowerEnv` seeded with `seed + i`, on another engine.
 
-    `physics` is mjx or newton-euler, in float32. Autoreset as in Gymnasium: by the next step, which ignores that
-    world's action and returns its next episode's first observation with reward 0, or with `SameStep` at once, the
-    last observation then being in `info["final_obs"]`.
+    `physics` is mjx or newton-euler, in float32. Autoreset as in Gymnasium: the next step ignores the action of an
+    ended world and returns the first observation of its next episode with reward 0. With `SameStep` the same step
+    returns it, and `info["final_obs"]` holds the last observation.
     """
 
     metadata = METADATA
@@ -53,10 +53,10 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
-        """Fresh worlds. `seed` seeds world i with `seed + i`, or each with its own of a list; None goes on."""
+        """Sampled worlds. World i is seeded with `seed + i`, or entry i of a list; None continues the random chain."""
         super().reset(seed=seed if isinstance(seed, int) else None)
-        anew = seed is not None or self._worlds.state is None
-        self._worlds.reset(self._numbers(seed) if anew else None)
+        reseed = seed is not None or self._worlds.state is None
+        self._worlds.reset(self._seeds(seed) if reseed else None)
         return self._worlds.seen(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -71,13 +71,13 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         return self._worlds.seen(), np.array(moved.reward, np.float64), terminated, truncated, info
 
     def _ended(self, moved: Any, ended: np.ndarray) -> dict[str, Any]:
-        """`info` of a step after which the worlds that `ended` (N,) have been started anew."""
+        """`info` of a step that has reset the worlds that `ended` (N,); `moved` is the state before the reset."""
         info: dict[str, Any] = dict(_vector_info(moved, ~ended))
         if ended.any():
             last = np.full(self.num_envs, None, object)
-            seen = self._worlds.seen(moved)
+            observations = self._worlds.seen(moved)
             for world in np.flatnonzero(ended):
-                last[world] = seen[world].copy()
+                last[world] = observations[world].copy()
             info |= {
                 "final_obs": last,
                 "_final_obs": ended,
@@ -86,8 +86,8 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
             }
         return info
 
-    def _numbers(self, seed: int | list[int | None] | None) -> list[int]:
-        """One number for each world, drawn as `FollowerEnv` would."""
+    def _seeds(self, seed: int | list[int | None] | None) -> list[int]:
+        """`core.seed_number` of each world, as in `FollowerEnv`."""
         if isinstance(seed, list) and len(seed) != self.num_envs:
             raise ValueError(f"{len(seed)} seeds were given for {self.num_envs} worlds")
         if seed is None:
@@ -98,7 +98,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
 
 
 def _vector_info(state: Any, where: np.ndarray) -> dict[str, np.ndarray]:
-    """Gymnasium's vector `info`: arrays (N,), 0 but `where` (N,) there is a value, and that mask."""
+    """Gymnasium's vector `info`: arrays (N,), valid `where` (N,) and else 0, each with that mask."""
     info = {}
     for name, value in core.info_of(state).items():
         info[name], info[f"_{name}"] = np.where(where, value, 0.0), where.copy()

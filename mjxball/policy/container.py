@@ -1,6 +1,6 @@
-"""The container of a policy file or a recorded flight: a zip of NPY arrays, read within bounds whatever it claims.
+"""Safe reading of `.npz` files (policies, recorded flights): zip archives of NPY arrays from untrusted sources.
 
-Nothing is unpickled, and no size that the file states is believed before it was compared with what is there.
+Nothing is unpickled, and every size that the file states is compared with the data before memory is allocated.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from mjxball.files import read_bytes
 
 MAX_BYTES = 64 * 2**20  # of the file, and of everything in it unpacked
 MAX_ENTRIES = 68
-DIRECTORY_ENTRY = b"PK\x01\x02"  # with which every entry of a zip's directory begins
-PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others may ask for gigabytes to unpack
+DIRECTORY_ENTRY = b"PK\x01\x02"  # signature of every entry of a zip's directory
+PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others may need gigabytes to unpack
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class PolicyFileError(InputError):
-    """A policy file that cannot be used; the message names the file and what is wrong."""
+    """A policy file cannot be used; the message names the file and the reason."""
 
 
 class _DamagedError(Exception):
-    """What is wrong with an entry, in a few words."""
+    """An entry of the archive is damaged; the message is a phrase."""
 
 
 def read_arrays(name: str, kind: str = "policy file", limit: int = MAX_BYTES) -> dict[str, np.ndarray]:
-    """The arrays of the `.npz` file `name` by their names, `limit` bytes at most.
+    """The arrays of the `.npz` file `name` by their names, at most `limit` bytes.
 
-    Raises PolicyFileError with one sentence on anything unsound; `kind` says in it what the file should be.
+    Raises PolicyFileError, with one sentence, if it is damaged or too large; `kind` describes the file in the message.
     """
     try:
         content = read_bytes(name, kind, limit)
@@ -48,15 +48,15 @@ def read_arrays(name: str, kind: str = "policy file", limit: int = MAX_BYTES) ->
             if sum(entry.file_size for entry in entries) > limit:
                 raise PolicyFileError(f"{name} is not a {kind}: it unpacks to more than {limit >> 20} MiB")
             names = [entry.filename.removesuffix(".npy") for entry in entries]
-            twice = next((key for key in names if names.count(key) > 1), None)
-            if twice is not None:
-                raise PolicyFileError(f"{name} holds the array {twice!r} more than once")
+            duplicate = next((key for key in names if names.count(key) > 1), None)
+            if duplicate is not None:
+                raise PolicyFileError(f"{name} holds the array {duplicate!r} more than once")
             return {key: _array(_unpack(archive, entry)) for key, entry in zip(names, entries, strict=True)}
     except PolicyFileError:
         raise
     except _DamagedError as error:
         raise PolicyFileError(f"{kind} {name} cannot be read: {error}") from None
-    except Exception:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
+    except Exception:  # zipfile, zlib and NumPy raise many kinds for damaged bytes
         raise PolicyFileError(f"{kind} {name} cannot be read: it is damaged or not an .npz") from None
 
 
@@ -64,7 +64,7 @@ def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     if entry.compress_type not in PLAIN:
         raise _DamagedError("it is packed with another method than NumPy's")
     with archive.open(entry) as stream:
-        # To read with a limit is what keeps a bomb from going off: `ZipFile.read` unpacks before it counts.
+        # A limit on the read protects against zip bombs: `ZipFile.read` unpacks everything before it checks the size.
         content = stream.read(entry.file_size)
     if len(content) != entry.file_size:
         raise _DamagedError("it is cut short")
@@ -72,7 +72,7 @@ def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
 
 
 def _array(content: bytes) -> np.ndarray:
-    """The array of an NPY file, if its header says exactly as much as follows it."""
+    """The array of an NPY file. Raises _DamagedError unless its header describes exactly the bytes that follow."""
     stream = io.BytesIO(content)
     if not content.startswith(np.lib.format.MAGIC_PREFIX):
         raise _DamagedError("an entry is not an array")

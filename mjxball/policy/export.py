@@ -1,4 +1,4 @@
-"""What training has learned -> a policy file. Reads Flax's arrays as NumPy, and imports NumPy only."""
+"""Policy files from trained networks. Flax's arrays are read as NumPy; only NumPy is imported."""
 
 from __future__ import annotations
 
@@ -23,20 +23,22 @@ from mjxball.policy.file import PolicyFile
 def policy_file(
     config: Config, law: FollowerLaw, learnt: Any, steps: int, origin: dict[str, Any] | None = None
 ) -> PolicyFile:
-    """The policy file of what has been learnt, see `algorithms.base.PolicyNetwork`.
+    """The policy file of a trained network, `learnt` (`algorithms.base.PolicyNetwork`), after `steps` steps.
 
-    `law`: that of `config` (`sim.follower.follower_law`). `origin` (command, seed, commit, ...) is added to the card.
+    `law`: `sim.follower.follower_law(config)`. `origin` (command, seed, commit, ...) is added to the metadata.
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
-    size = law.input_size  # behind it stand a GRU's state and what only critics saw, whose weights never moved
+    size = (
+        law.input_size
+    )  # further inputs are a GRU's state, and those of critics alone, whose weights are not exported
     mask = np.array(law.mask(follower.ignore_position))[:size]
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
     card = {
         "format_version": 5 if law.units else 1,
         "observation": [list(slot) for slot in OBSERVATION],
-        "history": 1,  # observations; more were possible until 0.1.0
+        "history": 1,  # number of observations; 0.1.0 and earlier allowed more
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
         **({"recurrent_units": law.units} if law.units else {}),
@@ -59,7 +61,7 @@ def policy_file(
         "bounds": {name: bound for name, bound in to_dict(config.bounds).items() if bound > 0},
         **(origin or {}),
     }
-    # What the network does not command is 0, the mean of nothing; behind the means stand the deviations.
+    # Outputs: means, then deviations of the action. The means of components that are not commanded become 0.
     keep = np.append(commanded(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(np.float32)
     weights[-1], biases[-1] = weights[-1] * keep, biases[-1] * keep
     return PolicyFile(
@@ -81,16 +83,16 @@ def _layers(learnt: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def _gru(learnt: Any) -> tuple[np.ndarray, ...] | None:
-    """Kernel, recurrent weights and bias of the GRU, float32; None if there is none."""
+    """Kernel, recurrent weights and bias of the GRU, float32; None without a GRU."""
     if "gru" not in learnt.layers:
         return None
     return tuple(np.asarray(learnt.layers["gru"][part], np.float32) for part in ("kernel", "recurrent", "bias"))
 
 
 def network_file(path: Path, learnt: Any, steps: int, origin: dict[str, Any]) -> bool:
-    """Write a policy for another environment than ours to `path`; False, and nothing is written, if it is not finite.
+    """Write a policy of a foreign environment to `path`. If it is not finite, nothing is written and False returned.
 
-    The arrays are those of a policy file (docs/policy-file.md); the card holds `origin` and `training_steps` alone.
+    The arrays are those of a policy file (docs/policy-file.md); the metadata are `origin` and `training_steps` only.
     """
     weights, biases = _layers(learnt)
     scale = np.asarray(learnt.mask) / np.asarray(learnt.deviation, np.float64)
@@ -110,7 +112,7 @@ def network_file(path: Path, learnt: Any, steps: int, origin: dict[str, Any]) ->
 
 
 def is_sound(policy: PolicyFile) -> bool:
-    """True if every number of `policy` is finite."""
+    """Whether every weight and scale of `policy` is finite."""
     return all(
         math.isfinite(float(np.abs(array).sum()))
         for array in (

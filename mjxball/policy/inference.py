@@ -1,4 +1,4 @@
-"""A trained follower, ready to be called once per control period."""
+"""Inference of a trained follower, called once per control period."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from mjxball.control.network import Network
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of, load_file
 
-ROUNDED = 1e-5  # that a GRU's state may be beyond 1
+ROUNDED = 1e-5  # tolerance for a GRU's state beyond 1, from rounding
 
 
 def not_told(name: str) -> InputError:
-    """What to say where nobody has told a policy its team."""
+    """The error for a policy that needs the geometry of its team and has none."""
     return InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
 
 
 def geometry_of(plant: Plant) -> np.ndarray:
-    """What each follower of a team on `plant` is told, `control.geometry`: (F, 4), or (4,) of one follower."""
+    """Geometry of the team on `plant` for each follower (F, 4), or (4,) for one follower (`control.geometry`)."""
     return np.asarray(team_geometry(plant, np.array([drone.mount for drone in plant.drones]), np.float64(plant.count)))
 
 
 def known_geometry(card: dict[str, Any], name: str) -> np.ndarray | None:
-    """What a policy has in its card of the team that it is for, (4,); None if it is told nothing.
+    """Geometry of the team in a policy's metadata, (4,); None for a policy that takes no geometry.
 
-    Raises InputError if it is told its team by `Policy.join` alone.
+    Raises InputError if it needs geometry that the metadata do not contain.
     """
     team = card.get("team")
     return _geometry_for(name, law_of(card), None if team is None else np.array(team["context"]))
 
 
 class Policy:
-    """A follower from a policy file. It remembers past observations if the file asks for them.
+    """A follower from a policy file, with the memory of past observations that its network needs.
 
-    One instance serves one flight, or one batch of worlds, of one thread: `reset()` starts anew. `law` is the same as
-    pure functions, memory in and memory out.
+    One instance serves one flight, or one batch of worlds, in one thread; `reset()` starts another. `law` is the same
+    controller as pure functions of memory and observation.
     """
 
     def __init__(self, contents: PolicyFile, name: str, dtype: type = np.float32):
@@ -65,87 +65,88 @@ class Policy:
         gru: Any = None if contents.gru is None else tuple(np.ascontiguousarray(part, dtype) for part in contents.gru)
         self._network = Network(self._weights, self._biases, self._mean, self._scale, gru)
         self._law = law_of(card)
-        told = self._law.geometry and "team" in card
-        self._geometry: Array | None = np.array(card["team"]["context"], dtype) if told else None
+        known = self._law.geometry and "team" in card
+        self._geometry: Array | None = np.array(card["team"]["context"], dtype) if known else None
         self._memory: Array | None = None
         self._thread = OneThread()
 
     @property
     def _facts(self) -> dict[str, object]:
+        """Properties that a representation shows, by label; None if absent."""
         layers = [len(bias) for bias in self._biases[:-1]]
-        made = {"preset": self.card.get("preset"), "seed": self.card.get("seed"), "steps": self.card["training_steps"]}
-        return {**made, "GRU": self._law.units or None, "layers": layers, "period": f"{1e3 * self.control_period:g} ms"}
+        run = {"preset": self.card.get("preset"), "seed": self.card.get("seed"), "steps": self.card["training_steps"]}
+        return {**run, "GRU": self._law.units or None, "layers": layers, "period": f"{1e3 * self.control_period:g} ms"}
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name} {value}" for name, value in self._facts.items() if value is not None)
-        return f"<Policy {self.name}: {told}>"
+        facts = ", ".join(f"{name} {value}" for name, value in self._facts.items() if value is not None)
+        return f"<Policy {self.name}: {facts}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks: what made it, and its returns over training."""
+        """HTML for notebooks: the run that trained it, and its learning curve."""
         from mjxball import pictures
 
         curve, lines = self.card.get("curve") or {}, []
         if curve.get("steps"):
             lines = [pictures.Curve("exploring", curve["steps"], curve["episode_return"])]
             lines += [pictures.Curve("evaluated", curve["eval_steps"], curve["eval_return"], dots=True)]
-        drawn = pictures.curves(lines, "environment steps", "return of an episode") if lines else ""
+        plot = pictures.curves(lines, "environment steps", "return of an episode") if lines else ""
         facts = {name: value for name, value in self._facts.items() if value is not None}
-        return pictures.card(f"policy {self.name}", facts, drawn)
+        return pictures.card(f"policy {self.name}", facts, plot)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
-        """Load a policy file; raise PolicyFileError with one sentence if it is unsound."""
+        """Load a policy file. Raises PolicyFileError, with one sentence, if it is invalid."""
         return cls(load_file(path), Path(path).stem)
 
     def join(self, plant: Plant) -> None:
-        """Tell it the team in which it flies, if it needs to know; before its first call."""
+        """Set the geometry of the team on `plant`, if the policy takes it. Must precede the first call."""
         if self._law.geometry:
             self._geometry = geometry_of(plant).astype(self._dtype)
 
     def reset(self) -> None:
-        """Forget past observations: the next call starts an episode."""
+        """Clear the memory: the next call starts an episode."""
         self.memory = None
 
     @property
     def law(self) -> NetworkLaw:
-        """What it answers and remembers, as pure functions."""
+        """The same controller as pure functions."""
         return NetworkLaw(self)
 
     @property
     def memory(self) -> Array:
-        """What it remembers (..., m), see `control.follower_law.FollowerLaw`; None: nothing yet."""
+        """Memory (..., m), see `control.follower_law.FollowerLaw`; None before the first call."""
         return self._memory
 
     @memory.setter
     def memory(self, memory: Array) -> None:
-        """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers, of a GRU up to 1."""
+        """Raises InputError, without a change, unless `memory` is finite, (..., m), and a GRU's state in [-1, 1]."""
         self._memory = None if memory is None else self._checked(memory)
         self._thread.forget()
 
     @property
     def hidden(self) -> Array | None:
-        """State of the network's GRU (..., H) in `memory`, each number from -1 to 1; None: no GRU, or nothing yet."""
+        """State of the GRU (..., H) in [-1, 1], a part of `memory`; None without a GRU or before the first call."""
         memory = self.memory if self._law.units else None
         return None if memory is None else self._law.hidden(memory)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which do not share the thread."""
+        """State of a copy, which may be used in another thread."""
         return {**self.__dict__, "_thread": OneThread()}
 
     def scaled(self, observation: Array) -> Array:
-        """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
+        """The network's action in [-1, 1] (..., 3) for `observation` (..., 18); updates the memory."""
         return np.asarray(self._answer(observation)[0], self._dtype)
 
     def __call__(self, observation: Array) -> Array:
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18).
 
-        Raises InputError for what is no observation (`checked_observation`) or has no finite answer, and remembers
-        nothing of it; RuntimeError if the flight that it remembers is another thread's.
+        Raises InputError, without a change of memory, for an invalid observation (`checked_observation`) or a result
+        that is not finite; RuntimeError if the memory belongs to a flight in another thread.
         """
         return np.asarray(self._answer(observation)[1], self._dtype)
 
     def _answer(self, observation: Array) -> tuple[Array, Array]:
-        """(action in [-1, 1], command) for `observation`, remembered if need be."""
+        """(action in [-1, 1], command) for `observation`; updates the memory."""
         observation = checked_observation(observation).astype(self._dtype, copy=False)
         remembers = self._law.size > 0
         if remembers:
@@ -153,7 +154,7 @@ class Policy:
         law, memory = self.law, self.memory if remembers else None
         if memory is not None:
             check_batch(self.name, memory.shape[:-1], observation)
-        with np.errstate(all="ignore"):  # what is not finite is refused below
+        with np.errstate(all="ignore"):  # results that are not finite are refused below
             action, command, memory = law.answer(law.start(observation) if memory is None else memory, observation)
         if not math.isfinite(float(command.sum()) + float(memory.sum())):
             raise InputError(f"policy {self.name} has no answer to an observation: what it computes is not finite")
@@ -162,23 +163,23 @@ class Policy:
         return action, command
 
     def _checked(self, memory: Array) -> Array:
-        """A copy of `memory`, or InputError unless it is one that this policy may have."""
+        """A copy of `memory`. Raises InputError unless it can be a memory of this policy."""
         given, size = real_numbers(memory, f"a memory of policy {self.name}"), self._law.size
         if given.shape[-1:] != (size,):
             raise InputError(f"policy {self.name} remembers {size} numbers, not an array of shape {given.shape}")
         with np.errstate(over="ignore"):
-            own = np.array(given, self._dtype)
-        if not np.isfinite(own).all():
+            copied = np.array(given, self._dtype)
+        if not np.isfinite(copied).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
-        if (np.abs(self._law.hidden(own)) > 1 + ROUNDED).any():
+        if (np.abs(self._law.hidden(copied)) > 1 + ROUNDED).any():
             raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
-        return own
+        return copied
 
 
 class NetworkLaw:
-    """A policy as pure functions of arrays (see `control.followers.Law`), on NumPy or JAX, for any number of threads.
+    """A policy as pure functions of NumPy or JAX arrays (see `control.followers.Law`), for any number of threads.
 
-    What they are given is not checked, so that JAX can trace them.
+    Arguments are not checked, so that JAX can trace the functions.
     """
 
     needs_privileged = False
@@ -192,12 +193,12 @@ class NetworkLaw:
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18).
 
-        Raises InputError if it has not been told its team, or of another number of followers.
+        Raises InputError if it needs a geometry that is not set, or is set for another number of followers.
         """
         geometry = _geometry_for(self.name, self._law, self._geometry)
         if geometry is not None and geometry.ndim > 1 and observation.shape[-2:-1] != geometry.shape[:1]:
-            told = f"policy {self.name} was told of {len(geometry)} followers (Policy.join)"
-            raise InputError(f"{told}, and an observation of shape {observation.shape} is not of so many")
+            joined = f"policy {self.name} was told of {len(geometry)} followers (Policy.join)"
+            raise InputError(f"{joined}, and an observation of shape {observation.shape} is not of so many")
         return self._law.start(observation, geometry)
 
     def hidden(self, memory: Array) -> Array:
@@ -211,14 +212,14 @@ class NetworkLaw:
 
     def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
-        seen = self._law.network_input(observation, memory) if self._law.size else observation
-        answer = self._network.like(observation)(seen)
-        command, remembered = self._law.command(answer, observation), self._law.next(memory, observation, answer)
-        return answer[..., : layout.ACTION_SIZE], command, remembered
+        network_input = self._law.network_input(observation, memory) if self._law.size else observation
+        output = self._network.like(observation)(network_input)
+        command, after = self._law.command(output, observation), self._law.next(memory, observation, output)
+        return output[..., : layout.ACTION_SIZE], command, after
 
 
 def _geometry_for(name: str, law: FollowerLaw, geometry: Array | None) -> Array | None:
-    """`geometry`, or InputError if the law needs it and there is none."""
+    """`geometry`. Raises InputError if it is None and `law` needs it."""
     if law.geometry and geometry is None:
         raise InputError(f"policy {name} has to be told its team before it flies (Policy.join)")
     return geometry

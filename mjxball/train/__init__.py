@@ -1,4 +1,4 @@
-"""Training: the run around a learning algorithm, and `train(config, key)`, the same as a pure function."""
+"""Training: runs of `train.py` with any algorithm, and `train(config, key)`, the same as a pure function."""
 
 from typing import TYPE_CHECKING, Any
 

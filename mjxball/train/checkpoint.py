@@ -1,4 +1,4 @@
-"""Checkpoints of a run with Orbax: the whole training state, written in the background, two kept, one in the end."""
+"""Checkpoints of a run with Orbax: the whole training state, written in the background."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
 from mjxball.train.run_directory import CHECKPOINTS, read_config
 
-KEEP = 2  # while training, so that one is left if the newest is damaged
+KEEP = 2  # checkpoints kept while training, so that one is left if the newest is damaged
 CHECKSUMS = "checksums"
-# What is wrong with a checkpoint is said here, in one line.
+# This module reports a damaged checkpoint itself, in one line.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
-def _without_late_answers(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """`sys.unraisablehook` that is silent where TensorStore answers a read that another one's failure has ended."""
+def _ignoring_closed_loop(previous: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`sys.unraisablehook` that drops errors of TensorStore reads which finish after another read has failed."""
 
     def hook(unraisable: Any) -> None:
         if str(unraisable.exc_value) != "Event loop is closed":
-            before(unraisable)
+            previous(unraisable)
 
     return hook
 
 
-sys.unraisablehook = _without_late_answers(sys.unraisablehook)
+sys.unraisablehook = _ignoring_closed_loop(sys.unraisablehook)
 
 
 class Checkpoints:
     """The checkpoints of one run directory, numbered by environment steps."""
 
     def __init__(self, run: Path, reading: bool = False):
-        """`reading` leaves everything there as it is: another process may be writing the next one."""
-        # Of several processes each acts for itself: process 0 writes, all read.
+        """With `reading` nothing is changed: another process may be writing the next checkpoint."""
+        # Processes of a distributed run do not synchronise in Orbax: process 0 writes, all read.
         alone = ocp.options.MultiprocessingOptions(
             primary_host=jax.process_index(),
             active_processes={jax.process_index()},
@@ -71,7 +71,7 @@ class Checkpoints:
             raise InputError(f"the checkpoints in {place} cannot be read: {why}") from None
 
     def save(self, state: TrainState) -> None:
-        """Start writing `state`, NumPy arrays; a step that is already there is not written again."""
+        """Start writing `state`, a tree of NumPy arrays. A step that was already saved is not written again."""
         step = int(np.ravel(np.asarray(state.steps))[0])  # the same for every member of a population
         if step in self._manager.all_steps():
             return
@@ -86,16 +86,16 @@ class Checkpoints:
         return sorted(self._manager.all_steps(), reverse=True)
 
     def restore(self, template: TrainState, warn: Callable[[str], None], discard: bool) -> TrainState | None:
-        """The newest sound state, shaped like `template` (arrays or `jax.ShapeDtypeStruct`); None if there is none.
+        """The newest readable state, shaped like `template` (arrays or `jax.ShapeDtypeStruct`); None without one.
 
-        Half-written checkpoints never count as complete; one that cannot be read is skipped and `warn`ed of, and
-        with `discard` deleted once an older one is restored: Orbax would refuse to save its steps again.
+        A checkpoint that cannot be read is skipped with a warning to `warn`. With `discard` it is deleted once an older
+        one is restored, because Orbax would refuse to save the same step again.
         """
-        wanted = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in _named_leaves(template).items()}
+        arrays = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in _named_leaves(template).items()}
         unreadable = []
         for step in self.steps():
             try:
-                state = _rebuild(template, self._read(step, wanted))
+                state = _rebuild(template, self._read(step, arrays))
             except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
                 warn(f"checkpoint {step} cannot be read and is skipped: {str(error).splitlines()[0][:200]}")
                 unreadable.append(step)
@@ -106,20 +106,20 @@ class Checkpoints:
             return state
         return None
 
-    def _read(self, step: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
-        """The arrays of one checkpoint; ValueError if one of them is not what was written."""
-        template = {**wanted, CHECKSUMS: np.empty(len(wanted), np.uint32)}
+    def _read(self, step: int, template: dict[str, np.ndarray]) -> dict[str, Any]:
+        """The arrays of one checkpoint by name, shaped like `template`. ValueError if a checksum does not match."""
+        with_checksums = {**template, CHECKSUMS: np.empty(len(template), np.uint32)}
         try:
-            arrays = self._manager.restore(step, args=ocp.args.StandardRestore(template))
-        except Exception:  # checkpoints before 0.2 have no checksums; of others this fails once more
-            return self._manager.restore(step, args=ocp.args.StandardRestore(wanted))
+            arrays = self._manager.restore(step, args=ocp.args.StandardRestore(with_checksums))
+        except Exception:  # checkpoints before 0.2 have no checksums; a damaged one fails again below
+            return self._manager.restore(step, args=ocp.args.StandardRestore(template))
         checksums = arrays.pop(CHECKSUMS)
         if (checksums != _checksums(arrays)).any():
             raise ValueError("its arrays are not what was written")
         return arrays
 
     def keep_newest(self) -> None:
-        """Delete all but the newest, once that is on disk: nothing of a finished run is continued."""
+        """Delete all but the newest checkpoint, once it is on disk: a finished run is not continued."""
         with self._written():
             self._manager.wait_until_finished()
             for step in self.steps()[1:]:
@@ -133,7 +133,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _written(self) -> Iterator[None]:
-        """Orbax raises here what went wrong while it wrote, now or before: InputError, which names the directory."""
+        """Turn errors of Orbax in this or an earlier write into InputError, which names the directory."""
         try:
             yield
         except Exception as error:  # of many kinds: a full disk is a ValueError
@@ -142,7 +142,7 @@ class Checkpoints:
 
 
 def _checksums(arrays: dict[str, Any]) -> np.ndarray:
-    """CRC-32 of every array in the order of their names (n,): TensorStore does not notice every damaged byte."""
+    """CRC-32 of each array (n,), sorted by name. TensorStore does not detect every damaged byte."""
     flat = (np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data for name in sorted(arrays))
     return np.array([zlib.crc32(part) for part in flat], np.uint32)
 
@@ -152,6 +152,7 @@ def _name(path: Any) -> str:
 
 
 def _rebuild(template: TrainState, arrays: dict[str, Any]) -> TrainState:
+    """The inverse of `_named_leaves`. ValueError if an array has another shape or type than in `template`."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     restored = [
         np.asarray(arrays[_name(path)]) if leaf.size else np.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves
@@ -169,11 +170,10 @@ def _named_leaves(state: Any) -> dict[str, Any]:
 
 
 def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> tuple[TrainState | None, int]:
-    """(newest state of the run directory that `read_config` describes, steps of its whole training).
+    """(newest saved state of `run`, environment steps of its whole training); `config` and `origin`: `read_config`.
 
-    The state holds NumPy arrays; None if none was ever saved.
-
-    Raises InputError if every checkpoint is damaged or the worlds were cut otherwise than now.
+    The state holds NumPy arrays, and is None if none was saved. Raises InputError if every checkpoint is damaged, or if
+    the environments were distributed over another number of devices.
     """
     population, parts = _population(config, origin), origin.get("parts", 1)
     if population.parts != parts:
@@ -190,15 +190,14 @@ def _restore(run: Path, population: Population, discard: bool) -> TrainState | N
     with contextlib.closing(Checkpoints(run, reading=not discard)) as checkpoints:
         if not checkpoints.steps():
             return None
-        say = lambda text: warn(f"warning: {text}")  # noqa: E731
-        state = checkpoints.restore(population.template(), say, discard)
+        state = checkpoints.restore(population.template(), lambda text: warn(f"warning: {text}"), discard)
     if state is None:
         raise InputError(f"{run} has no checkpoint that can be read")
     return state
 
 
 def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:
-    """Configuration, policy, environment steps and origin of a run's newest checkpoint; of a population the best's."""
+    """(configuration, policy, environment steps, origin) of a run's newest checkpoint, for its best member."""
     config, origin = read_config(run)
     population, best = _population(config, origin), best_member(read_members(run))
     state = _restore(run, population, discard=False)

@@ -1,4 +1,4 @@
-"""A run's tables and pictures: `members.csv` of a population, and return and accuracy over environment steps."""
+"""Learning curves of a run: `members.csv` of a population, and figures of return and error over environment steps."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from mjxball.train.run_directory import METRICS, read_metrics, read_rows, write_
 
 LOG = "members.csv"
 POLICIES = "members"
-COLUMNS = ("steps", "seed", "eval_return")  # and what the environment reports of an evaluation
+COLUMNS = ("steps", "seed", "eval_return")  # then the environment's metrics of an evaluation
 
 
 class MemberLog:
-    """`members.csv` of a run: one row for each member and evaluation, which TensorBoard has as well.
+    """`members.csv` of a run, with one row per member and evaluation, and the same values in TensorBoard's files.
 
     Without `out` nothing is written.
     """
 
     def __init__(self, out: Path | None, sessions: Sequence[Session] = (), seed: int = 0, resumed_at: int = 0):
-        """`sessions`: each member's."""
+        """`sessions`: one for each member. Rows after `resumed_at` steps are dropped."""
         self._out, self._sessions, self._seed = out, sessions, seed
         self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at] if out else []
-        self._at: dict[float, float] = {}  # steps -> when the evaluation was added [s]
+        self._at: dict[float, float] = {}  # environment steps -> time of the evaluation [s]
         self._write_events()
 
-    def add(self, steps: int, found: Mapping[str, np.ndarray]) -> None:
-        """Append one evaluation: every array is (members,)."""
-        for member, values in enumerate(zip(*found.values(), strict=True)):
-            named = dict(zip(found, map(float, values), strict=True))
+    def add(self, steps: int, results: Mapping[str, np.ndarray]) -> None:
+        """Append the `results` of one evaluation, arrays (members,) by column."""
+        for member, values in enumerate(zip(*results.values(), strict=True)):
+            named = dict(zip(results, map(float, values), strict=True))
             self._rows.append({"steps": steps, "seed": self._seed + member, **named})
         if self._out is None:
             return
@@ -45,30 +45,30 @@ class MemberLog:
         self._write_events()
 
     def _write_events(self) -> None:
-        """Every member's run in TensorBoard, anew: of some thousand members no file stays open."""
+        """Rewrite every member's run in TensorBoard: thousands of files cannot stay open."""
         if self._out is None:
             return
         for member, session in enumerate(self._sessions):
-            own = [row for row in self._rows if row["seed"] == self._seed + member]
-            named = tags((), (), [name.removeprefix("eval_") for name in (own[-1] if own else {}) if "eval_" in name])
-            points = [Point(int(row["steps"]), row, self._at.get(row["steps"], time.time())) for row in own]
+            rows = [row for row in self._rows if row["seed"] == self._seed + member]
+            named = tags((), (), [name.removeprefix("eval_") for name in (rows[-1] if rows else {}) if "eval_" in name])
+            points = [Point(int(row["steps"]), row, self._at.get(row["steps"], time.time())) for row in rows]
             Events(self._out, session, named, points).close()
 
     def best(self) -> int:
-        """The member with the highest return at the last evaluation; 0 before the first."""
+        """Index of the member with the highest return at the last evaluation; 0 before the first."""
         return best_member(self._rows)
 
     def policy_path(self, member: int) -> Path:
-        """Where a member's policy is written; only who writes the run may ask."""
+        """Policy file of a member. RuntimeError in a process that does not write the run."""
         if self._out is None:
             raise RuntimeError("this process writes no policies")
-        place = self._out / POLICIES
-        place.mkdir(exist_ok=True)
-        return place / f"seed{self._seed + member}.npz"
+        directory = self._out / POLICIES
+        directory.mkdir(exist_ok=True)
+        return directory / f"seed{self._seed + member}.npz"
 
 
 def read_members(run: Path) -> list[dict[str, float]]:
-    """Rows of a run's `members.csv`; none if it has no such file."""
+    """Rows of a run's `members.csv`; none without the file. InputError if it is damaged."""
     try:
         texts = read_rows(run / LOG)
     except MissingFileError:
@@ -88,7 +88,7 @@ def best_member(rows: list[dict[str, float]]) -> int:
 
 
 def draw_members(run: Path, path: Path) -> None:
-    """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
+    """Figure of all members over training: steady-state error and return of each, with median and quartiles."""
     from mjxball.plotting import BLUE, INK, legend_above, logarithmic, pyplot, save
 
     rows = read_members(run)
@@ -98,7 +98,7 @@ def draw_members(run: Path, path: Path) -> None:
     labels = (("eval_steady_error", "steady-state error [m]"), ("eval_return", "return of an episode"))
     for axis, (name, label) in zip(axes, labels, strict=True):
         table = np.array([[row[name] for row in rows if row["steps"] == step] for step in steps])
-        axis.plot(steps, table, ".-", color=INK, alpha=0.5, linewidth=0.8)  # one evaluation is a point
+        axis.plot(steps, table, ".-", color=INK, alpha=0.5, linewidth=0.8)  # markers show a single evaluation too
         if (known := np.isfinite(table).any(axis=1)).any():  # short episodes have no steady state
             at, (low, middle, high) = np.array(steps)[known], np.nanpercentile(table[known], [25, 50, 75], axis=1)
             axis.fill_between(at, low, high, color=BLUE, alpha=0.25, label="quartiles")
@@ -122,9 +122,9 @@ PANELS = {
 
 
 def training_summary(run: Path, seed: int) -> dict[str, Any]:
-    """What a policy's card says of the run directory `run` so far: its `curve` and the `seconds` it has taken.
+    """Metadata for the policy of member `seed`: the `curve` of the run so far and the `seconds` it has taken.
 
-    Raises InputError if its tables are damaged.
+    Raises InputError if the run's tables are damaged.
     """
     try:
         rows = _rows(run)
@@ -136,17 +136,17 @@ def training_summary(run: Path, seed: int) -> dict[str, Any]:
 
 
 def training_curve(run: Path, seed: int) -> dict[str, list[float]]:
-    """What a policy's card says of its training: environment steps, returns of an episode exploring and evaluated.
+    """Learning curve for a policy's metadata: environment steps, and returns of an episode exploring and evaluated.
 
-    In a population `episode_return` is the median over all members, `eval_return` the own one of member `seed`.
+    In a population `episode_return` is the median over all members, `eval_return` that of the member with `seed`.
     """
     rows = _rows(run)
     curve: dict[str, list[float]] = {
         "steps": [int(row["steps"]) for row in rows],
         "episode_return": [round(float(row["episode_return"]), 3) for row in rows],
     }
-    own: list[Any] = [row for row in read_members(run) if row["seed"] == seed]
-    evaluated: list[Any] = own or [row for row in rows if row["eval_return"]]
+    of_member: list[Any] = [row for row in read_members(run) if row["seed"] == seed]
+    evaluated: list[Any] = of_member or [row for row in rows if row["eval_return"]]
     curve["eval_steps"] = [int(row["steps"]) for row in evaluated]
     curve["eval_return"] = [round(float(row["eval_return"]), 3) for row in evaluated]
     return curve
@@ -157,14 +157,14 @@ def _rows(run: Path) -> list[dict[str, str]]:
 
 
 def draw_training(run: Path, config: Config, path: Path) -> None:
-    """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
+    """Plot `metrics.csv` of the directory `run` to `path`, whose directory is created."""
     from mjxball.plotting import BLUE, INK, legend_above, logarithmic, pyplot, save
 
     rows = _rows(run)
 
     def column(name: str) -> tuple[np.ndarray, np.ndarray]:
-        kept = [(int(row["steps"]), float(row[name])) for row in rows if row[name]]
-        return np.array([k for k, _ in kept]), np.array([v for _, v in kept])
+        points = [(int(row["steps"]), float(row[name])) for row in rows if row[name]]
+        return np.array([steps for steps, _ in points]), np.array([value for _, value in points])
 
     known = set(rows[0]) if rows else set()
     below = tuple(panel for panel in PANELS[config.reward.kind] if {name for name in panel[:2] if name} <= known)

@@ -1,4 +1,4 @@
-"""TensorBoard's events of a training: one run for all followers and one a member, called after preset and seed."""
+"""TensorBoard's files of a training: one run for all members and one for each, named after preset and seed."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.quiet import import_tensorboard
 
-EVENTS = "tensorboard"  # directory beside metrics.csv, with one for each run
+EVENTS = "tensorboard"  # directory beside metrics.csv, with a subdirectory for each run
 EVALUATION = "evaluation/"
 
 
 class Point(NamedTuple):
-    """What there is to say at one step."""
+    """Values of one row."""
 
     step: int
     values: Mapping[str, float | None]  # by column of metrics.csv or members.csv
-    at: float  # [s] by the clock
+    at: float  # wall-clock time [s]
 
 
 class Session(NamedTuple):
-    """A run's name in TensorBoard, and what it was made with."""
+    """A run's name in TensorBoard and its hyper-parameters."""
 
     name: str = "run"
     settings: Mapping[str, Any] = {}
 
 
 def session(config: Config, seed: int, members: int, origin: Mapping[str, Any]) -> Session:
-    """Of the followers with seeds from `seed` on: `transport-seed3`, of several `transport-seeds3-10`."""
+    """Session of `members` followers with seeds from `seed` on, such as `transport-seed3` or `transport-seeds3-10`."""
     algorithm = (origin.get("extensions") or {}).get("algorithm") or "sac"
     others = {name for name in ALGORITHMS if name != algorithm}
-    chosen = {path: value for path, value, _ in configs.leaves(config) if path.partition(".")[0] not in others}
-    plain = {path: configs.to_text(value) if isinstance(value, tuple) else value for path, value in chosen.items()}
+    used = {path: value for path, value, _ in configs.leaves(config) if path.partition(".")[0] not in others}
+    plain = {path: configs.to_text(value) if isinstance(value, tuple) else value for path, value in used.items()}
     name = f"{config.preset}-seed{seed}" if members == 1 else f"{config.preset}-seeds{seed}-{seed + members - 1}"
     return Session(name, {"algorithm": algorithm, "physics": origin["physics"], "seed": seed, **plain})
 
 
 def tags(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence[str]) -> dict[str, str]:
-    """Tag of every column of metrics.csv, in TensorBoard's groups; see `progress.columns`."""
+    """TensorBoard's tag, group/name, of every column of metrics.csv; the arguments are those of `progress.columns`."""
     groups = {
         "speed/": ("seconds", "rate"),
         "exploring/": ("episode_return", *exploring, "terminated", "diverged"),
@@ -55,17 +55,17 @@ def tags(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence
 
 
 class Events:
-    """One run in TensorBoard, written anew into its directory: what an earlier process wrote there goes."""
+    """The events file of one run, which replaces those of earlier processes."""
 
     def __init__(self, run: Path, session: Session, named: Mapping[str, str], points: Iterable[Point] = ()):
         """`named`: tag of each column; a column without one, and a value that is empty or not finite, is left out."""
-        place = run / EVENTS / session.name
-        place.mkdir(parents=True, exist_ok=True)
-        for older in place.glob("events.out.tfevents.*"):
+        directory = run / EVENTS / session.name
+        directory.mkdir(parents=True, exist_ok=True)
+        for older in directory.glob("events.out.tfevents.*"):
             older.unlink()
         self._parts, self._tags = import_tensorboard(), named
         host = socket.gethostname()
-        path = place / f"events.out.tfevents.{time.time():.6f}.{host}"
+        path = directory / f"events.out.tfevents.{time.time():.6f}.{host}"
         self._file = self._parts.record_writer.RecordWriter(str(path))
         self._write(time.time(), file_version="brain.Event:2")
         goals = dict.fromkeys(tag for tag in named.values() if tag.startswith(EVALUATION))
@@ -82,7 +82,7 @@ class Events:
                 self._write(point.at, step=point.step, summary=summary)
 
     def flush(self) -> None:
-        """Have everything on the disk, for a TensorBoard that looks on."""
+        """Write everything to disk, for a TensorBoard that is watching."""
         self._file.flush()
 
     def close(self) -> None:

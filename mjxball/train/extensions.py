@@ -1,4 +1,4 @@
-"""Environments, rewards and algorithms of the user's own: found by name, checked before anything is trained."""
+"""The user's environments, rewards and algorithms: imported by name and checked before training."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from mjxball.quiet import import_brax_env
 
 
 class Extensions(NamedTuple):
-    """What a run uses in place of ours; None: ours. Objects, or names such as "package.module:Class"."""
+    """Parts of a run that replace the built-in ones (None): objects, or names such as "package.module:Class"."""
 
-    env: Any = None  # class or function that makes a Brax environment, or one that is made
+    env: Any = None  # a Brax environment, or a class or function that makes one
     reward: Any = None  # function (state, action, next state) -> reward
     algorithm: Any = None  # class, see `mjxball.algorithms.base.Algorithm`
 
     def ours(self) -> bool:
-        """Whether everything that they name is part of mjxball."""
+        """Whether all of them are part of mjxball."""
         given = [one for one in self if one is not None]
         names = {one if isinstance(one, str) else f"{one.__module__}:{getattr(one, '__name__', '')}" for one in given}
         return names <= {*ALGORITHMS, *ALGORITHMS.values()}
@@ -40,7 +40,10 @@ DEFAULTS = Extensions()
 
 
 def find(name: str, flag: str) -> Any:
-    """The object that "package.module:Name" names, or one of ours; also modules in the current directory are found."""
+    """The object `name`, "package.module:Name" or a built-in algorithm. Searches the current directory too.
+
+    Raises InputError, which names the `flag`, if it cannot be imported.
+    """
     ours = ALGORITHMS if flag == "--algorithm" else {}
     module, _, attribute = ours.get(name, name).partition(":")
     if not module or not attribute:
@@ -48,7 +51,7 @@ def find(name: str, flag: str) -> Any:
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
     if flag == "--env":
-        import_brax_env()  # before the user's module does, and prints that Warp is absent
+        import_brax_env()  # quietly, before the user's module imports Brax, which prints that Warp is absent
     try:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -70,7 +73,7 @@ def find(name: str, flag: str) -> Any:
 
 
 def resolve(extensions: Extensions) -> Extensions:
-    """`extensions` with objects in the place of names. Raises InputError if one cannot be found."""
+    """`extensions` with names replaced by objects. Raises InputError if one cannot be found."""
     found = {
         field: find(value, f"--{field}") if isinstance(value, str) else value
         for field, value in extensions._asdict().items()
@@ -79,7 +82,7 @@ def resolve(extensions: Extensions) -> Extensions:
 
 
 def digest(names: Mapping[str, str | None]) -> str | None:
-    """Hash of the files that the named objects come from, None if there are none."""
+    """Hash of the source files of the named objects, None if there are none."""
     files = sorted(
         {
             inspect.getsourcefile(inspect.getmodule(find(name, f"--{flag}")) or object) or ""
@@ -93,12 +96,12 @@ def digest(names: Mapping[str, str | None]) -> str | None:
 
 
 def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
-    """The environment to train on: checked, with its reward, and with a time limit if it keeps none itself."""
+    """The checked environment to train on, with the reward of `extensions`, and with a time limit if it has none."""
     kind = extensions.env
     if kind is None:
         env: Any = TransportEnv(config, physics)
     else:
-        env = _made(kind, config, physics)
+        env = _instance(kind, config, physics)
         env = _checked_env(env if is_pair(env) else TracedOnce(env), name_of(extensions.env), config)
     if extensions.reward is not None:
         env = Rewarded(env, extensions.reward)
@@ -111,7 +114,7 @@ def is_pair(env: Any) -> bool:
 
 
 class TracedOnce:
-    """A foreign environment. Its functions may take seconds to trace, and are needed in several places."""
+    """A foreign environment with jitted `reset` and `step`, which may take seconds to trace and are used repeatedly."""
 
     def __init__(self, env: Any):
         self.env = env
@@ -123,27 +126,27 @@ class TracedOnce:
 
     @functools.cached_property
     def reset(self) -> Any:
-        """See the environment's own."""
+        """The environment's `reset`, jitted."""
         return jax.jit(self.env.reset)
 
     @functools.cached_property
     def step(self) -> Any:
-        """See the environment's own."""
+        """The environment's `step`, jitted."""
         return jax.jit(self.env.step)
 
     @functools.cached_property
     def observation_size(self) -> Any:
-        """Brax's are measured by a reset, which need not be computed, operation by operation, to know a size."""
-        found: list[Any] = []
+        """Length of an observation. Brax calls `reset` to find it, which is traced here instead of computed."""
+        sizes: list[Any] = []
         try:
-            jax.eval_shape(lambda: found.append(self.env.observation_size))
-        except jax.errors.JAXTypeError:  # it looks at numbers
+            jax.eval_shape(lambda: sizes.append(self.env.observation_size))
+        except jax.errors.JAXTypeError:  # it depends on values
             return self.env.observation_size
-        return self.env.observation_size if isinstance(found[0], jax.core.Tracer) else found[0]
+        return self.env.observation_size if isinstance(sizes[0], jax.core.Tracer) else sizes[0]
 
 
 class Rewarded:
-    """An environment with another reward."""
+    """An environment with the user's reward."""
 
     def __init__(self, env: Any, reward: Callable[[Any, Any, Any], Any]):
         self.env, self._reward = env, reward
@@ -155,19 +158,20 @@ class Rewarded:
         return getattr(self.env, name)
 
     def step(self, state: Any, action: Any) -> Any:
-        """The environment's own, but for the reward."""
+        """The environment's `step` with the reward replaced."""
         after = self.env.step(state, action)
         reward = self._reward(state, action, after)
         return after.replace(reward=jnp.broadcast_to(reward, after.reward.shape))
 
 
 def name_of(extension: Any) -> str:
-    """What an error calls the object."""
-    found = extension if inspect.isclass(extension) or inspect.isroutine(extension) else type(extension)
-    return f"{found.__module__}:{found.__qualname__}"
+    """The object's name, package.module:Name, for error messages."""
+    named = extension if inspect.isclass(extension) or inspect.isroutine(extension) else type(extension)
+    return f"{named.__module__}:{named.__qualname__}"
 
 
-def _made(kind: Any, config: Config, physics: str) -> Any:
+def _instance(kind: Any, config: Config, physics: str) -> Any:
+    """The environment that `kind`, a class or function, makes; `kind` itself if it is neither."""
     if not inspect.isclass(kind) and not inspect.isroutine(kind):
         return kind
     flag, given = f"--env {name_of(kind)}", {"config": config, "physics": physics}
@@ -188,7 +192,7 @@ def _made(kind: Any, config: Config, physics: str) -> Any:
 
 
 def _checked_env(env: Any, name: str, config: Config) -> Any:
-    """`env`, with a time limit if it keeps none itself."""
+    """`env`, with a time limit if it has none. Raises InputError if it does not follow Brax's interface."""
     flag = f"--env {name}"
     lost = [part for part in ("reset", "step", "observation_size", "action_size") if not _has(env, part)]
     if lost:
@@ -202,20 +206,20 @@ def _checked_env(env: Any, name: str, config: Config) -> Any:
     sizes = _read(flag, env, "observation_size"), _read(flag, env, "action_size")
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise InputError(f"{flag}: observation_size and action_size must be whole numbers, not {sizes}; flatten them")
-    each: tuple[int, ...] = first.reward.shape if is_pair(env) else ()  # followers of a team
+    each: tuple[int, ...] = first.reward.shape if is_pair(env) else ()  # (F,) with several followers
     timed = env
     if "truncation" not in first.info:
         import_brax_env()
         from brax.envs.wrappers.training import EpisodeWrapper
 
         timed = EpisodeWrapper(env, config.timing.episode_steps, 1)
-        first = jax.eval_shape(timed.reset, jax.random.PRNGKey(0))  # as it will be stepped, so that it is traced once
+        first = jax.eval_shape(timed.reset, jax.random.PRNGKey(0))  # the state that training steps: one trace for both
     after = _traced(flag, "step", env.step, first, jax.ShapeDtypeStruct((*each, sizes[1]), "float32"))
     for part, state in (("reset", first), ("step", after)):
-        for field, wanted in (("obs", (*each, sizes[0])), ("reward", each), ("done", ())):
+        for field, expected in (("obs", (*each, sizes[0])), ("reward", each), ("done", ())):
             shape = getattr(getattr(state, field, None), "shape", None)
-            if shape != wanted:
-                raise InputError(f"{flag}: {part} must return {field} of shape {wanted}, not {shape}")
+            if shape != expected:
+                raise InputError(f"{flag}: {part} must return {field} of shape {expected}, not {shape}")
     if jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), first) != jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), after
     ):
@@ -228,7 +232,7 @@ def _checked_env(env: Any, name: str, config: Config) -> Any:
 
 
 def _has(env: Any, part: str) -> bool:
-    """Whether there is such a part, even if reading it raises an error of its own."""
+    """Whether `env` has the attribute `part`, even if reading it raises an error other than AttributeError."""
     try:
         getattr(env, part)
     except AttributeError:
@@ -261,14 +265,14 @@ def _check_reward(env: Any, reward: Any) -> None:
         raise InputError(f"{flag} must take (state, action, next state)") from None
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     action = jax.ShapeDtypeStruct((*state.obs.shape[:-1], env.action_size), "float32")
-    found = _traced(flag, "the function", lambda s, a: reward(s, a, env.step(s, a)), state, action)
-    shape, kind = getattr(found, "shape", None), str(getattr(found, "dtype", type(found).__name__))
+    value = _traced(flag, "the function", lambda s, a: reward(s, a, env.step(s, a)), state, action)
+    shape, kind = getattr(value, "shape", None), str(getattr(value, "dtype", type(value).__name__))
     if shape not in ((), state.reward.shape) or not kind.startswith("float"):
         each = f" or one for each follower, shape {state.reward.shape}" if state.reward.shape else ""
         raise InputError(f"{flag} must return one number{each}, not shape {shape} of {kind}; sum it and use floats")
 
 
-ARGUMENTS = {"--reward": "state, action, next state", "--tracker": "name, settings"}  # of a user's functions
+ARGUMENTS = {"--reward": "state, action, next state", "--tracker": "name, settings"}  # of the user's functions
 
 
 def _check_callable(flag: str, what: str, function: Any) -> None:
@@ -277,6 +281,7 @@ def _check_callable(flag: str, what: str, function: Any) -> None:
 
 
 def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """`jax.eval_shape`; InputError if the user's `function` raises."""
     try:
         return jax.eval_shape(function, *arguments)
     except FOREIGN as error:

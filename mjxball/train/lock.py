@@ -1,4 +1,4 @@
-"""One training at a time in a run directory: a lock of the kernel's, which ends with its process and names it."""
+"""Lock of a run directory: one training at a time. The kernel releases it when its process ends."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _held = set[Path]()  # lock files of this process
 
 @contextlib.contextmanager
 def held(run: Path) -> Iterator[None]:
-    """Hold the run directory `run`, which is made, for this process.
+    """Lock the run directory `run`, which is created if needed, for this process.
 
-    Raises InputError, which names the holder, if another process does, or if the directory cannot be written.
+    Raises InputError, which names the holder, if another process holds it, or if the directory cannot be written.
     """
-    made = [place for place in (run, *run.parents) if not place.exists()]
+    created = [place for place in (run, *run.parents) if not place.exists()]
     try:
         run.mkdir(parents=True, exist_ok=True)
         lock = _acquired(run / LOCK)
@@ -37,22 +37,22 @@ def held(run: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        drop()  # while it is locked: who waits for it sees that it is another file
+        drop()  # before the release, so that a process waiting for the lock notices that the file is gone
         lock.release()
         with contextlib.suppress(OSError):
-            for place in made:  # those that nothing was written to
+            for place in created:  # removes empty directories only
                 place.rmdir()
 
 
 def check_free(run: Path) -> None:
-    """Raise InputError, which names the holder, if another process holds `run`. Makes nothing."""
+    """Raise InputError, which names the holder, if another process holds `run`. Creates no file."""
     if run / LOCK not in _held and (run / LOCK).exists():
         with contextlib.suppress(OSError):
             _acquired(run / LOCK).release()
 
 
 def drop() -> None:
-    """Remove this process's lock files; for who ends the process at once."""
+    """Remove the lock files of this process, before an exit that skips `finally`."""
     for path in list(_held):
         _held.discard(path)
         with contextlib.suppress(OSError):
@@ -60,7 +60,7 @@ def drop() -> None:
 
 
 def _acquired(path: Path) -> FileLock:
-    """The lock of the file `path`. Raises InputError if another process has it, and OSError."""
+    """The acquired lock of the file `path`. Raises InputError if another process has it, or OSError."""
     lock = FileLock(path, mode=0o666, blocking=False, fallback_to_soft=False)
     try:
         lock.acquire()
@@ -70,9 +70,9 @@ def _acquired(path: Path) -> FileLock:
 
 
 def _holder(path: Path) -> str:
-    """What the locked file says of its holder, which may be writing it."""
+    """Description of the process that holds the lock, from its file, which may be incomplete."""
     try:
-        found = parse_json(path.read_text(encoding="ascii"))
-        return f"process {found['pid']} on {found['host']}, since {found['since']}"
+        holder = parse_json(path.read_text(encoding="ascii"))
+        return f"process {holder['pid']} on {holder['host']}, since {holder['since']}"
     except (OSError, ValueError, RecursionError, KeyError, TypeError):
         return "another process"

@@ -1,4 +1,4 @@
-"""The training loop that `train.py` runs, of any algorithm: advance (collect, update), evaluate, save."""
+"""The training loop of `train.py` for any algorithm: advance (collect, update), evaluate, save."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mjxball.train.run import Chunk, Run, Stop, graceful_interrupt
 CHUNKS = 25  # rows of metrics.csv in a run, at most
 
 
-def train(run: Run, beside: Callable[[], None] = lambda: None) -> bool:
-    """Train to the end, or to Ctrl-C: False. Raises TrainingDivergedError; the last good policy stays on disk.
+def train(run: Run, on_start: Callable[[], None] = lambda: None) -> bool:
+    """Train to the end of the schedule; False after Ctrl-C. `on_start` is called when everything is compiled.
 
-    `beside` is called when everything is compiled.
+    Raises TrainingDivergedError; the last good policy stays on disk.
     """
     with contextlib.closing(run), contextlib.closing(run.progress):
         with graceful_interrupt(run.progress) as stop:
             run.start()
             stop.begun = True
-            beside()
+            on_start()
             finished = learn(run, stop)
             run.end(finished)
         return finished
@@ -35,11 +35,11 @@ def train(run: Run, beside: Callable[[], None] = lambda: None) -> bool:
 def learn(run: Run, stop: Stop) -> bool:
     """Train `run` to the end of its schedule; False if `stop` was requested before.
 
-    The host looks at a chunk of training, a row of metrics.csv, while the devices are at the next one.
+    The host processes a chunk of training, a row of metrics.csv, while the devices work on the next one.
     """
     plan = Plan.of(run.population.program)
-    waiting: Chunk | None = None  # the devices are at it, or done with it
-    # Several processes must stop at the same step, and agree on that between chunks alone.
+    waiting: Chunk | None = None  # submitted to the devices, row not written yet
+    # Several processes must stop at the same step, which they agree on between chunks.
     pause = (lambda: stop.requested) if jax.process_count() == 1 else lambda: False
     (ended,) = processes.any_of((stop.requested,))
     if run.done < plan.warmup and not ended:
@@ -49,9 +49,9 @@ def learn(run: Run, stop: Stop) -> bool:
         chunk = run.advance(programs.train(goal - run.done), pause)
         if waiting:
             run.progress.show(run.row(waiting))
-        # One that is cut short has no row: who resumes has one of the rest.
+        # A chunk that was cut short has no row; the resumed run writes one for its rest.
         waiting = chunk if run.done == goal else None
-        # All processes act on what they agreed on here, whenever a signal reaches one of them.
+        # A signal may reach one process only: all act on what they agree on here.
         ended, late = processes.any_of((stop.requested, run.saved_long_ago()))
         evaluates = evaluates and waiting is not None
         if waiting and (evaluates or late or ended):
@@ -64,12 +64,12 @@ def learn(run: Run, stop: Stop) -> bool:
 
 
 class Plan(NamedTuple):
-    """When there is a row of metrics.csv, and an evaluation. In steps of every environment."""
+    """Schedule of rows of metrics.csv and of evaluations, in steps of each environment."""
 
-    warmup: int  # steps with random actions, first
-    total: int  # all steps, those of the warm-up with them
-    chunk: int  # between two rows
-    evaluations: int
+    warmup: int  # first steps, with random actions
+    total: int  # all steps, including the warm-up
+    chunk: int  # steps between two rows
+    evaluations: int  # number of evaluations
 
     @classmethod
     def of(cls, program: Program) -> Plan:
@@ -79,7 +79,7 @@ class Plan(NamedTuple):
         return cls(program.warmup_rounds, total, chunk, program.schedule.num_evaluations)
 
     def next(self, done: int) -> tuple[int, bool]:
-        """(steps at the end of the chunk that begins or goes on at `done`, whether it ends in an evaluation)."""
+        """(steps at the end of the chunk that contains step `done`, whether an evaluation follows it)."""
         number, chunks = done // self.chunk + 1, math.ceil(self.total / self.chunk)
         goal = min(number * self.chunk, self.total)
         evaluates = number * self.evaluations // chunks > (number - 1) * self.evaluations // chunks

@@ -1,4 +1,4 @@
-"""Several followers trained at once: seeds, and optionally hyper-parameters that differ between members."""
+"""Population: several followers trained at once, with different seeds and optionally different hyper-parameters."""
 
 from __future__ import annotations
 
@@ -19,29 +19,23 @@ from mjxball.algorithms.base import Phase, PolicyNetwork, Shards
 from mjxball.config import Config
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
-from mjxball.train.compilation import (
-    Carrying,
-    TracedProgram,
-    compiler_options,
-    jax_setting,
-    partitioned_by_gspmd,
-)
+from mjxball.train.compilation import Carrying, TracedProgram, compiler_options, jax_setting, partitioned_by_gspmd
 from mjxball.train.extensions import DEFAULTS, Extensions
 from mjxball.train.program import Program, Statistics, TrainState, report, train, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
 class Carried:
-    """A state and its statistics as flat arrays, which compiled functions replace.
+    """A state and its statistics as a flat list of arrays, which compiled functions update.
 
-    To take the trees apart and to build them again at every call would slow a GPU's training by a quarter.
+    Flattening and rebuilding the trees at every call would slow training on a GPU by a quarter.
     """
 
     def __init__(self, state: TrainState, statistics: Statistics):
         self.arrays, self._structure = jax.tree.flatten((state, statistics))
 
     def trees(self) -> tuple[TrainState, Statistics]:
-        """What they are now."""
+        """The current state and statistics."""
         return jax.tree.unflatten(self._structure, self.arrays)
 
 
@@ -52,15 +46,15 @@ class Compiled(NamedTuple):
     episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
     collect: Callable[[Carried, Phase], Array]  # -> keys for `update`
     update: Callable[[Carried, Array], list[Array]]  # -> the algorithm's metrics, by name
-    wait: Callable[[], Any]  # until all of them are compiled; raises what went wrong
+    wait: Callable[[], Any]  # wait until all are compiled; raises errors of their compilation
 
 
 class Population:
     """`Program` for `members` followers at once, with a leading member axis unless there is only one.
 
-    Member k has seed `seed + k` and the k-th value of every swept setting. In one process the members are spread
-    over all its devices if their number divides evenly, else they share the first. Over several processes (see
-    `processes`) members and, where there are fewer than devices, each member's environments are spread over all.
+    Member k has seed `seed + k` and the k-th value of every swept setting. In one process, members are distributed over
+    its devices if these divide their number, else all use the first device. With several processes (see `processes`),
+    members are distributed over all devices, and if there are fewer members, each member's environments are too.
     """
 
     def __init__(
@@ -93,14 +87,14 @@ class Population:
         self._statistics_spec = Statistics(whole, whole, whole, split)
 
     def member_config(self, member: int) -> Config:
-        """The configuration of one member."""
+        """Configuration of one member."""
         config = self.config
         for name, values in self._sweep.items():
             config = configs.replace(config, name, float(values[member]))
         return config
 
     def member(self, value: Any, member: int) -> Any:
-        """One member's part of a state or of statistics."""
+        """One member's slice of a state or of statistics."""
         return value if self._single else jax.tree.map(lambda leaf: leaf[member], value)
 
     def each(self, value: Array | np.ndarray) -> np.ndarray:
@@ -115,17 +109,17 @@ class Population:
         return self._template
 
     def compile(self, creating: bool) -> Compiled:
-        """Compile everything a run needs, side by side; `begin` only if `creating`.
+        """Compile everything that a run needs, in parallel; `begin` only if `creating`.
 
-        On one device what is compiled already can be called while the rest still is.
+        On one device a function can be called while others are still being compiled.
         """
         options = compiler_options(self.program.algorithm, self.members)
-        # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
-        # end a process that shares GPUs with others by a segfault.
+        # XLA releases the GIL: the largest program is traced first, the others while it compiles. In a process that
+        # shares GPUs with others, two compilations at once crash.
         pool = ThreadPoolExecutor(4 if jax.process_count() == 1 else 1)
         with (
             partitioned_by_gspmd(self.mesh),
-            # Lines of Python in what is lowered are for profiles; XLA sorts and prints them all, a second's work.
+            # Python source locations serve profiles only, and cost XLA a second.
             jax_setting("jax_traceback_in_locations_limit", 0),
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
@@ -143,12 +137,12 @@ class Population:
         )
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
-        """collect, update, episodes and, if `creating`, begin on one device."""
+        """Lowered collect, update, episodes and, if `creating`, begin, for one device."""
         key, state = self._key, self.template()
         values, keys, phase = jax.tree.map(_shape, (*self._starts(0), warmup(1).phase))
         collect = lambda: (state, jax.tree.map(_shape, self.no_statistics()), phase)  # noqa: E731
         yield TracedProgram("collect", key, self._collect, collect, others=len(phase)).lower_carrying()
-        update = lambda: (state, _shape(self._drawn()))  # noqa: E731
+        update = lambda: (state, _shape(self._example_keys()))  # noqa: E731
         yield TracedProgram("update", key, self._update, update, others=1).lower_carrying()
         episodes = lambda: (values, keys, phase.random)  # noqa: E731
         yield TracedProgram("episodes", key, self._episodes, episodes, state.envs).lower()
@@ -158,7 +152,7 @@ class Population:
 
     @functools.cached_property
     def _key(self) -> dict[str, Any] | None:
-        """All that the traced programs depend on; None if nobody knows all of that."""
+        """Everything that the traced programs depend on; None if that is unknown, with the user's extensions."""
         if not self._extensions.ours():
             return None
         return {
@@ -166,56 +160,54 @@ class Population:
             "physics": self._physics,
             "algorithm": type(self.program.algorithm).__name__,
             "members": self.members,
-            "swept": {name: values.tolist() for name, values in self._values.items()},  # constants in what is traced
+            "swept": {name: values.tolist() for name, values in self._values.items()},  # traced as constants
             "source": source_hash(),
             "versions": versions(),
         }
 
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
-        """The same on several devices."""
+        """The same as `_lower_here` for several devices."""
         values, keys = self._starts(0)
         state, statistics = self._placed_shapes(self.template(), self._state_spec), self.no_statistics()
-        phase, drawn = (
-            self._as_argument(warmup(1).phase, PartitionSpec()),
-            self._as_argument(self._drawn(), self._whole),
-        )
+        phase = self._as_argument(warmup(1).phase, PartitionSpec())
+        update_keys = self._as_argument(self._example_keys(), self._whole)
         carried = (self._state_spec, self._statistics_spec)
         yield self._carrying(self._collect, (state, statistics, phase), (*carried, self._whole), 2)
-        yield self._carrying(self._update, (state, drawn), (self._state_spec, self._whole), 1)
+        yield self._carrying(self._update, (state, update_keys), (self._state_spec, self._whole), 1)
         yield jax.jit(self._episodes, **self._results(self._split)).lower(values, keys, phase.random)
         if creating:
             begun = self._results(self._state_spec._replace(envs=()))
             yield jax.jit(self._begin, **begun).lower(values, keys)
 
     def _carrying(self, function: Callable[..., Any], arguments: Any, results: Any, carried: int) -> Carrying:
-        """`function` lowered on several devices; of its arguments it carries the first so many on."""
+        """`function` lowered for several devices. It carries the arrays of its first `carried` arguments."""
         leaves, structure = jax.tree.flatten(arguments)
         count = len(jax.tree.leaves(arguments[:carried]))
         shapes = jax.eval_shape(function, *arguments)
-        places = jax.tree.leaves(self._placed_shapes(shapes, results))
+        placed = jax.tree.leaves(self._placed_shapes(shapes, results))
 
         def flat(*arrays: Any) -> list[Any]:
             return jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
 
-        compiled = jax.jit(flat, donate_argnums=range(count), out_shardings=[place.sharding for place in places])
-        return Carrying(compiled.lower(*leaves), count, range(len(leaves)), range(count))
+        jitted = jax.jit(flat, donate_argnums=range(count), out_shardings=[shape.sharding for shape in placed])
+        return Carrying(jitted.lower(*leaves), count, range(len(leaves)), range(count))
 
     def start(self, compiled: Compiled, seed: int) -> TrainState:
-        """Fresh training states."""
+        """Initial training states."""
         values, keys = self._starts(seed)
         training = self._as_argument(np.asarray(True), PartitionSpec())
         return compiled.begin(values, keys)._replace(envs=compiled.episodes(values, keys, training))
 
     def start_from(self, state: TrainState, policies: Sequence[PolicyFile]) -> TrainState:
         """`state` with the network of one of `policies` in every member; see `FirstOrderGradient.start_from`."""
-        algorithm: Any = self.program.algorithm  # of its kind
-        known = processes.gather(state.algorithm)
-        begun = [
-            algorithm.start_from(self.member(known, number), policies[number % len(policies)])
-            for number in range(self.members)
+        algorithm: Any = self.program.algorithm  # a FirstOrderGradient
+        learnt = processes.gather(state.algorithm)
+        started = [
+            algorithm.start_from(self.member(learnt, member), policies[member % len(policies)])
+            for member in range(self.members)
         ]
-        known = begun[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *begun)
-        return state._replace(algorithm=self.place(known, self._whole))
+        learnt = started[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *started)
+        return state._replace(algorithm=self.place(learnt, self._whole))
 
     def evaluation_envs(self, compiled: Compiled) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""
@@ -228,24 +220,24 @@ class Population:
         return self.program.policy(self.member(state, member))
 
     def report(self, statistics: Statistics, steps: int, evaluation: bool) -> dict[str, np.ndarray]:
-        """What statistics of NumPy arrays over `steps` say of the environment's metrics: {name: (members,)}."""
+        """The environment's metrics {name: (members,)} from statistics (NumPy arrays) over `steps`."""
         each = lambda values: {name: self.each(value).astype(float) for name, value in values.items()}  # noqa: E731
         count = steps * self.program.schedule.num_envs
         return report(self.program.env, each(statistics.totals), each(statistics.peaks), count, evaluation)
 
     def metric_names(self) -> tuple[list[str], list[str]]:
-        """Names of what `report` says of training and of evaluation."""
+        """Names of the metrics that `report` returns for training and for evaluation."""
         names = self.template().envs.metrics
         totals, peaks = dict.fromkeys(names, np.zeros(self.members)), dict.fromkeys(names, np.zeros((self.members, 1)))
-        found = [report(self.program.env, totals, peaks, 1, evaluation) for evaluation in (False, True)]
-        return list(found[0]), list(found[1])
+        training, evaluation = (report(self.program.env, totals, peaks, 1, flag) for flag in (False, True))
+        return list(training), list(evaluation)
 
     def place_state(self, state: TrainState) -> TrainState:
-        """A whole state of NumPy arrays, the same in every process, spread over the devices."""
+        """Distribute a state of NumPy arrays, equal in every process, over the devices."""
         return jax.tree.map(lambda spec, part: self.place(part, spec), self._state_spec, state, is_leaf=_is_spec)
 
     def _placed(self, tree: Any, specs: Any) -> Any:
-        """`_as_argument` of the parts of a tree."""
+        """`_as_argument` of the parts of `tree`, each with its spec."""
         return jax.tree.map(lambda spec, part: self._as_argument(part, spec), specs, tree, is_leaf=_is_spec)
 
     def place_phase(self, phase: Phase) -> Phase:
@@ -253,11 +245,11 @@ class Population:
         return self.place(phase, PartitionSpec())
 
     def place_keys(self, keys: np.ndarray) -> Array:
-        """The members' keys, the same in every process, on their devices."""
+        """Distribute the members' keys, equal in every process, over the devices."""
         return self.place(keys, self._whole)
 
     def place(self, tree: Any, spec: PartitionSpec) -> Any:
-        """Arrays that every process holds alike, cut over the devices as `spec` says."""
+        """Distribute arrays, equal in every process, over the devices as given by `spec`."""
         if self.mesh is None:
             return jax.tree.map(jnp.asarray, tree)
         sharding = NamedSharding(self.mesh, spec)
@@ -269,7 +261,7 @@ class Population:
         return jax.tree.map(cut, tree)
 
     def _as_argument(self, tree: Any, spec: PartitionSpec) -> Any:
-        """`place` for arguments that no program keeps: one device takes NumPy's arrays as they are."""
+        """`place` for arguments that no program donates: a single device takes NumPy arrays directly."""
         return tree if self.mesh is None else self.place(tree, spec)
 
     def _keys(self, seed: int) -> np.ndarray:
@@ -288,8 +280,8 @@ class Population:
         return self._on_mesh(begin, (self._whole,), result, (0,))(values, keys)
 
     def _episodes(self, values: Any, keys: Array, training: Array | np.ndarray) -> Any:
-        draw = lambda program, key, training: program.episodes(key, training)  # noqa: E731
-        return self._on_mesh(draw, (self._whole, PartitionSpec()), self._split, (0, None))(values, keys, training)
+        episodes = lambda program, key, training: program.episodes(key, training)  # noqa: E731
+        return self._on_mesh(episodes, (self._whole, PartitionSpec()), self._split, (0, None))(values, keys, training)
 
     def _collect(self, state: TrainState, statistics: Statistics, phase: Phase) -> tuple[TrainState, Statistics, Array]:
         collect = lambda program, *arguments: program.collect(*arguments)  # noqa: E731
@@ -304,7 +296,7 @@ class Population:
         return self._on_mesh(update, specs, specs, (0, 0))(self._values, state, keys)
 
     def no_statistics(self) -> Statistics:
-        """Of no steps."""
+        """Statistics of no steps: zeros."""
         each = () if self._single else (self.members,)
         zero: Any = np.zeros(each, np.float32)
         peak: Any = np.zeros((*each, self.program.schedule.num_envs), np.float32)
@@ -313,27 +305,30 @@ class Population:
         return self._placed(statistics, self._statistics_spec)
 
     def no_metrics(self) -> list[Any]:
-        """Of no update."""
+        """Metrics of no update: zeros."""
         return [self.no_statistics().reward] * len(self.program.algorithm.metrics)
 
     def named(self, metrics: Sequence[Any]) -> dict[str, Any]:
         """Metrics of `Compiled.update` by name."""
         return dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True))
 
-    def _drawn(self) -> np.ndarray:
-        """Something like the keys that a collection leaves for the update."""
+    def _example_keys(self) -> np.ndarray:
+        """Zeros with the shape of the keys that `collect` returns for `update`."""
         algorithm = self.program.algorithm
         count = algorithm.collect_keys + algorithm.update_keys + 1
         *members, width = self.template().key.shape
         return np.zeros((*members, count, width), np.uint32)
 
     def _on_mesh(self, one: Callable[..., Any], specs: Any, results: Any, axes: tuple[int | None, ...]) -> Any:
-        """`one(program, *arguments)` for all members over the mesh, as a function of (values, *arguments)."""
+        """`one(program, *arguments)` for all members over the mesh, as a function of (swept values, *arguments).
+
+        `axes`: member axis of each argument, None if all members share it. `specs`, `results`: partition specs.
+        """
 
         def every(values: Any, *arguments: Any) -> Any:
             if self._single:
                 return one(self.program, *arguments)
-            each = lambda own, *arguments: one(self._member_program(own), *arguments)  # noqa: E731
+            each = lambda swept, *arguments: one(self._member_program(swept), *arguments)  # noqa: E731
             return jax.vmap(each, in_axes=(0, *axes), axis_size=self._members_here)(values, *arguments)
 
         if self.mesh is None:
@@ -345,12 +340,12 @@ class Population:
         return self.members // (self.mesh.shape["members"] if self.mesh else 1)
 
     def _results(self, *specs: Any) -> dict[str, Any]:
-        """Where `jax.jit` shall leave its results."""
+        """Arguments of `jax.jit` that set the shardings of its results."""
         mesh = self.mesh
         if mesh is None:
             return {}
-        places = jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs, is_leaf=_is_spec)
-        return {"out_shardings": places if len(places) > 1 else places[0]}
+        shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs, is_leaf=_is_spec)
+        return {"out_shardings": shardings if len(shardings) > 1 else shardings[0]}
 
     def _placed_shapes(self, template: Any, specs: Any) -> Any:
         """`template` with the shardings that `place_state` gives."""
@@ -371,6 +366,8 @@ class Population:
 
 
 def _when_ready(pending: Future[Callable[..., Any]]) -> Callable[..., Any]:
+    """A function that waits for the compiled function at its first call."""
+
     def call(*arguments: Any) -> Any:
         return pending.result()(*arguments)
 
@@ -386,9 +383,10 @@ def _shape(array: Any) -> jax.ShapeDtypeStruct:
 
 
 def grid(members: int, devices: int, split: bool) -> tuple[int, int]:
-    """(groups of members, parts of each member's environments) that the devices are arranged in.
+    """(groups of members, parts of each member's environments): the shape of the grid of devices.
 
-    Without `split` a member stays on one device, and members that do not divide evenly share the first.
+    Without `split` a member's environments stay on one device, and if `devices` does not divide `members`, all members
+    use the first device.
     """
     groups = math.gcd(members, devices)
     if split:

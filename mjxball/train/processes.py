@@ -1,4 +1,4 @@
-"""Several processes that train together over JAX's own multi-process runtime; process 0 writes."""
+"""Distributed training: several processes over JAX's multi-process runtime, of which process 0 writes files."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.terminal import warn
 from mjxball.train import lock
 
-HEARTBEAT = 20  # [s] after which a process that does not answer counts as dead
-PATIENCE = 120  # [s] for all processes to come together at the start
-MOST = 4096  # processes; JAX would make room for a billion
+HEARTBEAT = 20  # [s] after which a process that does not respond counts as dead
+PATIENCE = 120  # [s] within which all processes must connect at the start
+MOST = 4096  # processes; JAX would allocate for a billion
 
 
 @dataclass(frozen=True)
 class Rendezvous:
-    """Where the processes meet. Without a coordinator JAX asks SLURM, Open MPI or Kubernetes."""
+    """How the processes find each other. Without a coordinator JAX asks SLURM, Open MPI or Kubernetes."""
 
     coordinator: str | None = None  # HOST:PORT of process 0
     processes: int | None = None
@@ -51,60 +51,60 @@ class Rendezvous:
             raise InputError(f"--process must be 0 .. {self.processes - 1}, not {self.process}")
 
 
-def join(meeting: Rendezvous) -> None:
-    """Join the other processes. Must come before anything else asks JAX for its devices.
+def join(rendezvous: Rendezvous) -> None:
+    """Connect to the other processes. Must precede every other use of JAX's devices.
 
-    If they do not come together within `PATIENCE` the process says so and ends with exit code 2: JAX would abort it.
-    JAX waits outside Python, hence in a thread of its own: the main thread hears signals meanwhile.
+    If they do not connect within `PATIENCE`, the process prints an error and exits with code 2, where JAX would abort.
+    JAX waits in a separate thread, because it blocks outside Python; the main thread still handles signals.
     """
     import jax
 
-    own = meeting.coordinator if meeting.process == 0 else None
-    bound = None if own is None else _bound(own)
-    where = f"at {meeting.coordinator}" if meeting.coordinator else f"under {' and '.join(_surroundings())}"
+    own_address = rendezvous.coordinator if rendezvous.process == 0 else None
+    bind_address = None if own_address is None else _bind_address(own_address)
+    where = f"at {rendezvous.coordinator}" if rendezvous.coordinator else f"under {' and '.join(_schedulers())}"
     failures: list[Exception] = []
 
     def initialize() -> None:
         try:
             jax.distributed.initialize(
-                meeting.coordinator,
-                meeting.processes,
-                meeting.process,
+                rendezvous.coordinator,
+                rendezvous.processes,
+                rendezvous.process,
                 _only_device(),
                 initialization_timeout=10 * PATIENCE,
                 heartbeat_timeout_seconds=HEARTBEAT,
-                coordinator_bind_address=bound,
+                coordinator_bind_address=bind_address,
             )
-        except Exception as error:  # those of Kubernetes' client are of a kind of their own
+        except Exception as error:  # Kubernetes' client raises errors of its own classes
             failures.append(error)
 
     waiting = threading.Thread(target=initialize, daemon=True)
-    with warnings.catch_warnings(action="ignore"):  # the sentence says what they would
+    with warnings.catch_warnings(action="ignore"):  # the error message below replaces them
         waiting.start()
         waiting.join(PATIENCE)
     if waiting.is_alive():
         warn(f"error: the processes did not come together {where} within {PATIENCE} s: each must reach process 0")
-        os._exit(2)  # whoever ends a thread of JAX's in another way aborts
+        os._exit(2)  # any other exit would abort while JAX's thread runs
     for error in failures:
         why = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        unknown = meeting.coordinator is None and isinstance(error, ValueError)
+        unknown = rendezvous.coordinator is None and isinstance(error, ValueError)
         raise InputError(_advice() if unknown else f"the processes cannot come together {where}: {why}") from None
 
 
 def _only_device() -> list[int] | None:
-    """The one GPU that this process may see is its number 0; JAX takes it for that of its place in the node."""
+    """[0] if this process sees one GPU: JAX would take the index of the process on its node instead."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     return [0] if visible and "," not in visible else None
 
 
-def _bound(coordinator: str) -> str | None:
-    """Where process 0 listens: at `coordinator` alone, or None, on all interfaces, if that is none of this machine's.
+def _bind_address(coordinator: str) -> str | None:
+    """Address at which process 0 listens: `coordinator`, or None (all interfaces) if this machine does not have it.
 
-    A machine behind address translation does not have the address at which others reach it. InputError if another
-    program listens at that port, at which JAX would crash.
+    Behind address translation, a machine does not have the address at which others reach it. InputError if another
+    program uses the port, where JAX would crash.
     """
     host, _, port = coordinator.rpartition(":")
-    for name, place in ((host.strip("[]"), coordinator), ("", None)):
+    for name, address in ((host.strip("[]"), coordinator), ("", None)):
         family = socket.AF_INET6 if ":" in name else socket.AF_INET
         try:
             socket.create_server((name, int(port)), family=family).close()
@@ -114,12 +114,12 @@ def _bound(coordinator: str) -> str | None:
                     f"--coordinator {coordinator}: another program of this machine has that port"
                 ) from None
         else:
-            return place
+            return address
     return None
 
 
-# What each says of itself, and what makes JAX understand it.
-SURROUNDINGS = {
+# Scheduler: (variable that it sets, what the user must do so that JAX finds the processes).
+SCHEDULERS = {
     "SLURM": ("SLURM_JOB_ID", "start the processes with srun"),
     "Open MPI": (
         "OMPI_COMM_WORLD_SIZE",
@@ -130,53 +130,53 @@ SURROUNDINGS = {
 }
 
 
-def _surroundings() -> list[str]:
-    """Which of `SURROUNDINGS` this process runs in."""
-    return [name for name, (variable, _) in SURROUNDINGS.items() if variable in os.environ]
+def _schedulers() -> list[str]:
+    """Names of the `SCHEDULERS` that this process runs under."""
+    return [name for name, (variable, _) in SCHEDULERS.items() if variable in os.environ]
 
 
 def _advice() -> str:
-    """What to do if JAX cannot tell from the surroundings where the processes meet."""
-    found = _surroundings()
+    """Error message if JAX cannot find the other processes through a scheduler."""
+    found = _schedulers()
     if not found:
         return (
-            f"--distributed found none of {', '.join(SURROUNDINGS)}: start it with srun or mpirun, "
+            f"--distributed found none of {', '.join(SCHEDULERS)}: start it with srun or mpirun, "
             "or pass --coordinator HOST:PORT --processes N --process I"
         )
-    ways = "; ".join(SURROUNDINGS[name][1] for name in found)
+    ways = "; ".join(SCHEDULERS[name][1] for name in found)
     return f"--distributed found {' and '.join(found)}, but not where the processes meet: {ways}"
 
 
 def leave() -> None:
-    """Part from the other processes; this one may go on alone."""
+    """Shut down jax.distributed; this process may continue alone."""
     import jax
 
     jax.distributed.shutdown()
 
 
 def is_writer() -> bool:
-    """True in the one process that writes files and prints."""
+    """Whether this is process 0, which writes files and prints."""
     import jax
 
     return jax.process_index() == 0
 
 
 def gather(tree: Any) -> Any:
-    """The whole of every array as NumPy, copied, in every process; all must call it."""
+    """`tree` with every distributed array copied to NumPy as a whole, in every process. All processes must call it."""
     import jax
 
     leaves, structure = jax.tree.flatten(tree)
     spread = [k for k, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable]
     if spread:
-        together = _replicate(leaves[spread[0]].sharding.mesh)([leaves[k] for k in spread])
-        for k, leaf in zip(spread, together, strict=True):
+        replicated = _replicate(leaves[spread[0]].sharding.mesh)([leaves[k] for k in spread])
+        for k, leaf in zip(spread, replicated, strict=True):
             leaves[k] = leaf.addressable_data(0)
     return jax.tree.unflatten(structure, [np.array(leaf) for leaf in leaves])
 
 
 @functools.cache
 def _replicate(mesh: Any) -> Any:
-    """The program that brings arrays whole to every device; one, so that it is compiled once for each tree."""
+    """Jitted function that copies whole arrays to every device; cached, so that it compiles once per tree."""
     import jax
     from jax.sharding import NamedSharding, PartitionSpec
 
@@ -184,7 +184,7 @@ def _replicate(mesh: Any) -> Any:
 
 
 def any_of(flags: tuple[bool, ...]) -> tuple[bool, ...]:
-    """Each flag, true if it is true in any process; all must call it."""
+    """For each flag, whether it is true in any process. All processes must call it."""
     import jax
     from jax.experimental import multihost_utils
 
@@ -195,12 +195,12 @@ def any_of(flags: tuple[bool, ...]) -> tuple[bool, ...]:
 
 
 @contextlib.contextmanager
-def holding(run: Path, meeting: bool, check: Callable[[], Any]) -> Iterator[None]:
-    """Hold the run directory `run` for all processes, see `lock.held`, and `check` it then, both in process 0.
+def holding(run: Path, distributed: bool, check: Callable[[], Any]) -> Iterator[None]:
+    """Lock the run directory `run` (see `lock.held`), then `check` it, both in process 0 for all processes.
 
-    Raises InputError in every process if it is refused.
+    Raises InputError in every process if either fails.
     """
-    if not meeting:
+    if not distributed:
         with lock.held(run):
             check()
             yield
@@ -222,10 +222,10 @@ def holding(run: Path, meeting: bool, check: Callable[[], Any]) -> Iterator[None
 
 @contextlib.contextmanager
 def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
-    """If this or another process fails, say so, name `resume` as the way on, and end with a non-zero exit code.
+    """If this or another process fails, print an error that recommends `resume`, and exit with a non-zero code.
 
-    A lost process shows in two ways: a collective operation raises, or JAX's runtime aborts this process. For the
-    second a small watcher process prints the sentence.
+    After the loss of a process, a collective operation raises, or JAX's runtime aborts this process. In the second case
+    a small watcher process prints the error.
     """
     advice = f"Start all of them again with {resume}"
     watcher = _watcher(f"\nthis process was ended, because another one of the run was lost. {advice}")
@@ -241,7 +241,7 @@ def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
         _dismiss(watcher)
         why = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         warn(f"process {jax.process_index()} cannot go on, because it or another one failed: {why}. {advice}")
-        os._exit(FAULT)  # the runtime's own farewell would wait for the lost process
+        os._exit(FAULT)  # a normal shutdown of JAX would wait for the lost process
     finally:
         _dismiss(watcher)
 

@@ -1,4 +1,4 @@
-"""The training program: environments side by side, collect and update, apart or as one compiled function."""
+"""The training program: batched environments, and collect and update, separately or as one compiled function."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from mjxball.train.extensions import DEFAULTS, Extensions, find, is_pair, make_e
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-MATMUL_PRECISION = "highest"  # float32 throughout: GPUs would else round products to TF32
+MATMUL_PRECISION = "highest"  # float32 throughout: by default GPUs round products to TF32
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
-EVALUATION_DRAW = 20_261_121  # tells the evaluation's environments from those of any seed
+EVALUATION_DRAW = 20_261_121  # folded into the key, so that no seed trains on the evaluation's environments
 
 
 class Statistics(NamedTuple):
@@ -34,11 +34,11 @@ class Statistics(NamedTuple):
     reward: Float[Array, ""]  # mean reward per step, summed over steps
     ended: Float[Array, ""]  # episodes terminated
     totals: dict[str, Float[Array, ""]]  # each of the environment's metrics, summed over environments and steps
-    peaks: dict[str, Float[Array, " envs"]]  # the largest of each
+    peaks: dict[str, Float[Array, " envs"]]  # maximum of each metric over steps
 
 
 def joined(first: Statistics, second: Statistics) -> Statistics:
-    """Statistics of the steps of both."""
+    """Statistics over the steps of both."""
     return Statistics(
         reward=first.reward + second.reward,
         ended=first.ended + second.ended,
@@ -48,16 +48,16 @@ def joined(first: Statistics, second: Statistics) -> Statistics:
 
 
 class Envs(NamedTuple):
-    """What `Environments.step` carries on."""
+    """States of `Environments` and statistics of the steps so far."""
 
     states: Any  # brax State of all environments
     statistics: Statistics
 
 
 def report(env: Any, totals: Mapping[str, Any], peaks: Mapping[str, Any], count: float, evaluation: bool) -> Any:
-    """What metrics.csv says of an environment's metrics: {name: (members,)}, NaN where there is nothing to say.
+    """An environment's columns of metrics.csv, {name: (members,)}, NaN if undefined, from sums over `count` steps.
 
-    The environment's own `report(totals, peaks, count, evaluation)`, else the mean of each of its metrics.
+    These are `env.report(totals, peaks, count, evaluation)`, if it exists, else the mean of each metric.
     """
     if hasattr(env, "report"):
         return env.report(totals, peaks, count, evaluation)
@@ -65,13 +65,16 @@ def report(env: Any, totals: Mapping[str, Any], peaks: Mapping[str, Any], count:
 
 
 class Agents:
-    """Which followers of worlds of several are data: those that fly, world after world.
+    """Mapping between worlds of teams and agents, the followers that fly, numbered world after world.
 
-    A world has F slots for followers, of which one of N drones fills the first N - 1.
+    A world has F slots for followers. In a world of N drones the first N - 1 slots are filled.
     """
 
     def __init__(self, sizes: Sequence[int], slots: int, count: int):
-        """`count` followers in worlds whose numbers of drones are `sizes`, again and again. May raise InputError."""
+        """`count` agents in worlds of `sizes` drones, repeated cyclically, with F = `slots`.
+
+        Raises InputError if `count` does not fill whole cycles.
+        """
         each = sum(sizes) - len(sizes)
         if count % each:
             raise InputError(
@@ -82,15 +85,15 @@ class Agents:
         followers = [size - 1 for size in sizes] * (count // each)
         self.world = np.repeat(np.arange(self.worlds), followers)
         self.first = np.concatenate([[0], np.cumsum(followers)[:-1]])  # (worlds,) the agent in the first slot
-        # (count,) so that worlds of every size, and every one of a few worlds, have turns of their own.
+        # (count,) chosen so that episode starts are staggered over worlds of each size, and over few worlds too.
         self.turn = self.world // len(sizes) + self.world % len(sizes)
         self.slot = np.arange(count) - self.first[self.world]
-        # (worlds, F); slots that nobody fills show the first agent, whatever it does there has no effect.
+        # (worlds, F); empty slots repeat the first agent, whose action has no effect there.
         filled = np.arange(slots) < np.array(followers)[:, None]
         self.table = np.where(filled, self.first[:, None] + np.arange(slots), self.first[:, None])
 
     def per_agent(self, states: Any) -> Any:
-        """States of worlds (worlds, [F,] ...) with all fields but `pipeline_state` for every agent (count, ...)."""
+        """States (worlds, [F,] ...) with all fields but `pipeline_state` rearranged by agent (count, ...)."""
         own = {name: getattr(states, name)[self.world, self.slot] for name in ("obs", "reward")}
         shared = {name: jax.tree.map(lambda leaf: leaf[self.world], getattr(states, name)) for name in SHARED}
         return states.replace(**own, **shared)
@@ -102,16 +105,16 @@ class Agents:
         return states.replace(**own, **shared)
 
 
-SHARED = ("done", "metrics", "info")  # fields of a state that all followers of a world have in common
+SHARED = ("done", "metrics", "info")  # fields of a state that all followers of a world share
 
 
 class Environments:
     """`count` environments on each shard; see `mjxball.algorithms.base.Environments`.
 
-    Beyond Brax's `Env` an environment may have `input_mask` and `critic_mask` (n,), and `report` (above). One with
-    `team_sizes` is of several followers (see `mjxball.env`): each of them counts as one of `count`, and states hold
-    (count, ...) but for their `pipeline_state`, which holds worlds; a world starts anew as its first follower does. Its
-    `reset` has a second argument, the world's number.
+    Besides Brax's `Env` interface, an environment may have `input_mask` and `critic_mask` (n,), and `report` (above).
+    One with `team_sizes` has several followers (see `mjxball.env`). Each follower then counts as one environment:
+    states are (count, ...), but `pipeline_state` is (worlds, ...). A world is reset when its first follower is. Its
+    `reset` takes the index of the world as a second argument.
     """
 
     def __init__(self, env: Any, count: int, shards: Shards | None = None):
@@ -121,7 +124,7 @@ class Environments:
         self.policy_mask = getattr(env, "input_mask", None) or [1.0] * self.observation_size
         self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
         self.smooth = is_pair(env)
-        # Number by number a CPU takes half of the time for a closed-form step; MJX gains nothing, and compiles longer.
+        # `scalar_form` halves the time of a closed-form step on a CPU. MJX gains nothing, and compiles longer.
         closed = self.smooth and env.backend == "newton-euler" and jax.default_backend() == "cpu"
         self._step = (scalar_form if closed else jax.vmap)(env.step)
         sizes = getattr(env, "team_sizes", None)
@@ -133,20 +136,19 @@ class Environments:
         return self._agents.worlds if self._agents else self.count
 
     def reset(self, key: Array) -> Any:
-        """New states of all environments."""
+        """Sampled initial states of all environments."""
         keys = jax.random.split(self.shards.own(key), self._worlds)
         if self._agents:
-            numbers = jnp.arange(self._worlds)
-            fresh = jax.vmap(self.env.reset)(keys, numbers)
+            fresh = jax.vmap(self.env.reset)(keys, jnp.arange(self._worlds))
             return self._agents.per_agent(fresh)
         return jax.vmap(self.env.reset)(keys)
 
     def staggered(self, states: Any, key: Array, episode_steps: int) -> Any:
-        """`states` with part of their episodes behind them, so that they do not end together."""
+        """`states` with random step counters, so that episodes do not end together."""
         steps = jax.random.randint(self.shards.own(key), (self._worlds,), 0, episode_steps)
         if "steps" in states.info:
-            kept = states.info["steps"]
-            return states.replace(info={**states.info, "steps": steps.astype(kept.dtype)})
+            dtype = states.info["steps"].dtype
+            return states.replace(info={**states.info, "steps": steps.astype(dtype)})
         world = states.pipeline_state
         if "steps" in getattr(world, "_fields", ()):
             return states.replace(pipeline_state=world._replace(steps=steps))
@@ -174,28 +176,28 @@ class Environments:
         done = envs.states.done.astype(bool)
         ended = done if others is None else done | others
 
-        def anew(before: Any) -> Any:
+        def reset_ended(before: Any) -> Any:
             return self._mixed(ended, self.drawn(envs, key), before)
 
-        if jax.default_backend() != "cpu":  # a GPU's host would wait for the condition
-            return envs._replace(states=anew(envs.states))
-        return envs._replace(states=jax.lax.cond(ended.any(), anew, lambda before: before, envs.states))
+        if jax.default_backend() != "cpu":  # on a GPU the host would wait for the condition
+            return envs._replace(states=reset_ended(envs.states))
+        return envs._replace(states=jax.lax.cond(ended.any(), reset_ended, lambda before: before, envs.states))
 
     def _mixed(self, ended: Bool[Array, " envs"], fresh: Any, before: Any) -> Any:
-        """`fresh` states where `ended`, else those of `before`."""
+        """States `fresh` where `ended`, else `before`."""
         agents = self._agents
 
-        def reset_if(these: Array, new: Any, old: Any) -> Any:
+        def where(condition: Array, new: Any, old: Any) -> Any:
             def one(new: Array, old: Array) -> Array:
-                return jnp.where(these.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+                return jnp.where(condition.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
 
             return jax.tree.map(one, new, old)
 
         if not agents:
-            return reset_if(ended, fresh, before)
-        worlds = reset_if(ended[agents.first], fresh.pipeline_state, before.pipeline_state)
-        shown = (one.replace(pipeline_state=()) for one in (fresh, before))
-        return reset_if(ended[agents.first][agents.world], *shown).replace(pipeline_state=worlds)
+            return where(ended, fresh, before)
+        worlds = where(ended[agents.first], fresh.pipeline_state, before.pipeline_state)
+        per_agent = (states.replace(pipeline_state=()) for states in (fresh, before))
+        return where(ended[agents.first][agents.world], *per_agent).replace(pipeline_state=worlds)
 
     def step(
         self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None, fresh: Any = None
@@ -216,7 +218,7 @@ class Environments:
         return stepped if key is None else self.restart(stepped, key), transition
 
     def over_shards(self, statistics: Statistics) -> Statistics:
-        """Statistics of all shards together; `peaks` stay each shard's own environments."""
+        """Statistics over all shards; `peaks` remain those of each shard's environments."""
         total = self.shards.total
         return statistics._replace(
             reward=self.shards.mean(statistics.reward), ended=total(statistics.ended), totals=total(statistics.totals)
@@ -224,45 +226,45 @@ class Environments:
 
 
 class Mode(NamedTuple):
-    """What a call of `Program.advance` does. The phase is traced, so that one executable serves all of them."""
+    """Number of steps and phase of a call of `Program.advance`. Both are traced: one executable serves all modes."""
 
-    steps: Int[Array | np.ndarray, ""]  # of every environment
+    steps: Int[Array | np.ndarray, ""]  # of each environment
     phase: Phase
 
 
 def warmup(steps: int) -> Mode:
-    """Random actions, recorded."""
+    """Mode with random actions, which are recorded."""
     return _mode(steps, random=True, evaluate=False)
 
 
 def train(steps: int) -> Mode:
-    """Sampled actions, recorded, with updates."""
+    """Mode with actions sampled from the policy, which are recorded, and updates."""
     return _mode(steps, random=False, evaluate=False)
 
 
 def evaluate(steps: int) -> Mode:
-    """The policy's mean; nothing is recorded or learnt."""
+    """Mode with the policy's mean action. Nothing is recorded or learnt."""
     return _mode(steps, random=False, evaluate=True)
 
 
 def _mode(steps: int, random: bool, evaluate: bool) -> Mode:
-    # NumPy's: each of JAX's own would compile a program to make it.
+    # NumPy scalars, because JAX compiles a program to create each of its own.
     return Mode(np.asarray(steps, np.int32), Phase(np.asarray(random), np.asarray(evaluate)))
 
 
 class TrainState(NamedTuple):
     """Everything needed to continue a run exactly."""
 
-    algorithm: Any  # what the algorithm knows
+    algorithm: Any  # the algorithm's state
     envs: Any  # brax State of all environments
     key: Array
     steps: Int[Array, ""]  # environment steps recorded
 
 
 class Program:
-    """`create(key)` makes the state, `advance(state, mode)` moves it on; both jittable and vmappable.
+    """Training of one follower: `create(key)` returns a state, `advance(state, mode)` the next. Both can be vmapped.
 
-    `overrides` maps config paths to values, arrays included, so that a population can differ in them. With
+    `overrides` maps config paths to values, possibly traced arrays, in which members of a population differ. With
     `shards` every function works on one part and must run under `jax.shard_map` over their axis.
     """
 
@@ -277,10 +279,10 @@ class Program:
         for path, value in (overrides or {}).items():
             config = configs.replace(config, path, value)
         self.config, self._shards = config, shards or Shards()
-        with jax.default_matmul_precision(MATMUL_PRECISION):  # what is traced for checks need not be traced again
+        with jax.default_matmul_precision(MATMUL_PRECISION):  # as in training, which reuses the traces of checks
             self.env = make_env(extensions, config, physics)
         make: Any = extensions.algorithm or find(ALGORITHMS["sac"], "--algorithm")
-        # The algorithm says how many environments there are, and is told the part of them that is here.
+        # The algorithm sets the number of environments, and is then made again with this shard's part of them.
         sizes = getattr(self.env, "team_sizes", None)
         fewest = sum(sizes) - len(sizes) if sizes else 1
         schedule: Schedule = make(config, Environments(self.env, fewest, Shards())).schedule
@@ -289,30 +291,30 @@ class Program:
         self.schedule = schedule
 
     def create(self, key: Array) -> TrainState:
-        """A fresh training state."""
+        """Initial training state."""
         return self.begin(key)._replace(envs=self.episodes(key, np.asarray(True)))
 
     def begin(self, key: Array) -> TrainState:
-        """A fresh training state but for its environments."""
+        """Initial training state without environments."""
         learner_key, _, _, key = jax.random.split(key, 4)
         return TrainState(algorithm=self.algorithm.init(learner_key), envs=(), key=key, steps=jnp.zeros((), jnp.int32))
 
     def episodes(self, key: Array, training: Bool[Array | np.ndarray, ""]) -> Any:
-        """Newly reset environments: those that `create(key)` trains on, else those of every evaluation with `key`.
+        """Initial states of all environments, of `create(key)` if `training`, else of every evaluation with `key`.
 
         Episodes of training are staggered, so that they do not end together.
         """
         _, env_key, stagger_key, _ = jax.random.split(key, 4)
-        own_key = jnp.where(training, env_key, jax.random.fold_in(key, EVALUATION_DRAW))
-        envs = self.environments.reset(own_key)
+        reset_key = jnp.where(training, env_key, jax.random.fold_in(key, EVALUATION_DRAW))
+        envs = self.environments.reset(reset_key)
         staggered = self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps)
         return jax.tree.map(lambda new, old: jnp.where(training, new, old), staggered, envs)
 
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Float[Array, ""]]]:
         """Step all environments `mode.steps` times (rounded up to whole collections), and learn.
 
-        Returns the state, sums over all steps, and the metrics of the algorithm's last update. One function of all,
-        which `Population` spares XLA: `collect` and `update` apart compile sooner, side by side.
+        Returns the state, sums over all steps, and the metrics of the algorithm's last update. `Population` compiles
+        `collect` and `update` separately instead, which takes less time in parallel.
         """
 
         def body(_: Array, carry: Any) -> Any:
@@ -327,28 +329,28 @@ class Program:
         return jax.lax.fori_loop(0, rounds, body, start)
 
     def collect(self, state: TrainState, statistics: Statistics, phase: Phase) -> tuple[TrainState, Statistics, Array]:
-        """One collection of the algorithm: the state, `statistics` with it, and keys for the `update` that follows."""
+        """One collection of the algorithm: (state, updated `statistics`, keys for the following `update`)."""
         algorithm = self.algorithm
-        # One draw for many keys: each draw is kernels to compile and to launch.
+        # One split for all keys, because each split is several kernels to compile and launch.
         keys = jax.random.split(state.key, algorithm.collect_keys + algorithm.update_keys + 1)
         envs = self.environments.begin(state.envs)
         with jax.default_matmul_precision(MATMUL_PRECISION):
-            known, envs = algorithm.collect(state.algorithm, envs, list(keys[: algorithm.collect_keys]), phase)
+            learnt, envs = algorithm.collect(state.algorithm, envs, list(keys[: algorithm.collect_keys]), phase)
         taken = self.schedule.num_envs * algorithm.steps_per_collect
         steps = state.steps + jnp.where(phase.recording, taken, 0)
-        seen = self.environments.over_shards(envs.statistics)
-        return TrainState(known, envs.states, keys[-1], steps), joined(statistics, seen), keys
+        collected = self.environments.over_shards(envs.statistics)
+        return TrainState(learnt, envs.states, keys[-1], steps), joined(statistics, collected), keys
 
     def update(self, state: TrainState, keys: Array, phase: Phase) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-        """The algorithm's update after a `collect`, which gave the `keys`: the state and the algorithm's metrics."""
+        """One update of the algorithm, with the `keys` of the preceding `collect`: (state, the algorithm's metrics)."""
         progress = jnp.minimum(state.steps / self.schedule.total_steps, 1.0)
-        own = list(keys[self.algorithm.collect_keys : -1])
+        update_keys = list(keys[self.algorithm.collect_keys : -1])
         with jax.default_matmul_precision(MATMUL_PRECISION):
-            known, metrics = self.algorithm.update(state.algorithm, own, progress, phase)
-        return state._replace(algorithm=known), self._shards.mean(metrics)
+            learnt, metrics = self.algorithm.update(state.algorithm, update_keys, progress, phase)
+        return state._replace(algorithm=learnt), self._shards.mean(metrics)
 
     def evaluation_envs(self, key: Array) -> Any:
-        """Newly reset environments, the same at every evaluation with `key`."""
+        """Initial states of all environments, the same for every evaluation with `key`."""
         return self.episodes(key, np.asarray(False))
 
     def policy(self, state: TrainState) -> PolicyNetwork:
@@ -357,7 +359,7 @@ class Program:
 
     @property
     def evaluation_steps(self) -> int:
-        """Steps of an evaluation, whole collections: of another environment than the pair an episode's."""
+        """Steps of an evaluation, in whole collections: `EVALUATION_SECONDS` of ours, an episode of a foreign one."""
         timing, window = self.config.timing, self.algorithm.steps_per_collect
         steps = timing.episode_steps
         if is_pair(self.env):
@@ -367,8 +369,8 @@ class Program:
     def evaluated_return(self, reward: Any, ended: Any) -> Any:
         """Return of an episode, from `Statistics.reward` and `.ended` of an evaluation.
 
-        Of the pair, whose rewards are costs, what a whole episode sums up to; of another environment, for which going
-        on may be what earns, that over the number of episodes begun in the time of one.
+        In our environment, whose rewards are costs, it is the mean reward times the steps of an episode. In a foreign
+        one, which may reward survival, that is divided by the number of episodes begun in the time of one.
         """
         episodes = self.config.timing.episode_steps / self.evaluation_steps
         begun = 1 if is_pair(self.env) else 1 + episodes * ended / self.schedule.num_envs
@@ -381,5 +383,5 @@ class Program:
 
     @property
     def warmup_rounds(self) -> int:
-        """Of these, the ones with random actions."""
+        """Steps of each environment with random actions; part of `total_rounds`."""
         return math.ceil(self.schedule.warmup_steps / self.schedule.num_envs)

@@ -1,4 +1,4 @@
-"""The live status of a training and the rows of `metrics.csv`."""
+"""Progress of a training: the status line at a terminal, and the rows of `metrics.csv`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mjxball.terminal import Status
 from mjxball.train.events import Events, Point, Session, tags
 from mjxball.train.run_directory import CONFIG_FILE, read_metrics, write_rows
 
-# steps: environment steps so far; seconds: of training, compilation included, of a resumed run what came before its
-# checkpoint too; rate: environment steps per second of all members together, updates included; episode_return: mean
-# reward x episode steps, exploring. Then what environment and algorithm report, and episodes that ended before their
-# time limit or left the finite range.
+# steps: environment steps so far. seconds: time of training and compilation, in a resumed run including the time up to
+# its checkpoint. rate: environment steps per second of all members together, updates included. episode_return: mean
+# reward x episode steps, exploring. Further columns: metrics of environment and algorithm, and the numbers of episodes
+# that were terminated and that diverged.
 COMMON = ("steps", "seconds", "rate", "episode_return")
 KEYS = "Ctrl-C saves and stops"
 Row = dict[str, Any]  # by column; the columns of an evaluation are absent between evaluations
@@ -26,20 +26,21 @@ Start = Callable[[str, dict[str, Any]], Log]  # of a user's tracker: (the run's 
 
 
 def columns(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence[str]) -> dict[str, str]:
-    """Columns of `metrics.csv`, from what the environment reports (exploring, evaluated) and the algorithm.
+    """Columns of `metrics.csv` with their tags in TensorBoard ('' for `steps`).
 
-    Each with its tag in TensorBoard, '' of `steps`.
+    The arguments are names of metrics: the environment's while exploring, the algorithm's, the environment's while
+    evaluated.
     """
-    found = [*COMMON, *exploring, *algorithm, "terminated", "diverged", "eval_return"]
-    known = tags(exploring, algorithm, evaluated)
-    return {name: known.get(name, "") for name in (*found, *(f"eval_{name}" for name in evaluated))}
+    names = [*COMMON, *exploring, *algorithm, "terminated", "diverged", "eval_return"]
+    tag_of = tags(exploring, algorithm, evaluated)
+    return {name: tag_of.get(name, "") for name in (*names, *(f"eval_{name}" for name in evaluated))}
 
 
 def started(tracker: Start, session: Session) -> Log:
-    """What is called with every row. Raises InputError if there is none."""
+    """The function that the user's `tracker` returns, to be called with every row. Raises InputError if it fails."""
     try:
         log = tracker(session.name, dict(session.settings))
-    except FOREIGN as error:  # whatever another's program raises
+    except FOREIGN as error:  # any error of the user's program
         raise InputError(f"--tracker raised {said(error)}") from error
     if not callable(log):
         raise InputError(f"--tracker must return what is called with every row, not {type(log).__name__}")
@@ -47,10 +48,10 @@ def started(tracker: Start, session: Session) -> Log:
 
 
 class Progress:
-    """Shows a status at a terminal, else a line a row; appends rows to `metrics.csv` and to TensorBoard's events.
+    """Shows a status at a terminal, else a line per row, and appends rows to `metrics.csv` and TensorBoard's events.
 
-    Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again. Without a `path`
-    nothing is printed or written.
+    In a run that is resumed at `resumed_at` steps, later rows are dropped, because they will be written again. Without
+    a `path` nothing is printed or written.
     """
 
     def __init__(
@@ -71,8 +72,8 @@ class Progress:
         self._status = Status(stream or sys.stderr)
         self._start = time.monotonic()
         self._doing = "", "", KEYS
-        self._latest: tuple[Row, float] | None = None  # and when it came
-        self.before = 0.0  # [s] what the run took before it was resumed
+        self._latest: tuple[Row, float] | None = None  # the newest row and its time [s]
+        self.before = 0.0  # time that the run took before it was resumed [s]
         self._silent, self._log = path is None, tracker
         if path is None:
             return
@@ -83,8 +84,8 @@ class Progress:
         self._writer = csv.DictWriter(self._file, self._names)
         config = path.with_name(CONFIG_FILE)
         began = config.stat().st_mtime if config.exists() else time.time()
-        told = {name: tag for name, tag in names.items() if tag}
-        self._events = Events(path.parent, session, told, [_point(row, began) for row in kept])
+        tagged = {name: tag for name, tag in names.items() if tag}
+        self._events = Events(path.parent, session, tagged, [_point(row, began) for row in kept])
         self._events.flush()
 
     def elapsed(self) -> float:
@@ -92,7 +93,7 @@ class Progress:
         return time.monotonic() - self._start
 
     def begin(self, doing: str, what: str = "", keys: str = KEYS) -> None:
-        """Show what is done until there is a row, and how long it has taken; without a terminal say it, if `what`."""
+        """Show `doing` `what` and its duration until there is a row. Without a terminal print it once, if `what`."""
         if self._silent:
             return
         if what and not self._status.live:
@@ -101,18 +102,18 @@ class Progress:
         self._status.show(self._lines)
 
     def say(self, text: str) -> None:
-        """Print a line of its own."""
+        """Print a line above the status."""
         if not self._silent:
             self._status.say(text)
 
     def show(self, row: Row) -> None:
-        """Record `row` and show it."""
+        """Append `row` to all files and show it."""
         if self._silent:
             return
         try:
             self._writer.writerow(row)
             self._file.flush()
-        except OSError as error:  # of a full disk it does not say where
+        except OSError as error:  # for a full disk it does not name the file
             raise OSError(error.errno, error.strerror, self._file.name) from None
         self._events.add(Point(row["steps"], row, time.time()))
         self._events.flush()
@@ -123,17 +124,17 @@ class Progress:
         self._status.show(self._lines)
 
     def _track(self, row: Row) -> None:
-        """Tell the tracker; one that fails is told no more, and the training goes on."""
+        """Pass `row` to the tracker. After an error it is not called again, and training continues."""
         if self._log is None:
             return
         try:
             self._log({name: value for name, value in row.items() if value is not None})
-        except FOREIGN as error:  # whatever another's program raises
+        except FOREIGN as error:  # any error of the user's program
             self._log = None
             self.say(f"warning: --tracker raised {said(error)}; it is told no more rows")
 
     def _lines(self) -> list[list[str]]:
-        """What a terminal shows now."""
+        """Current lines of the status, each a list of phrases."""
         if self._latest is None:
             doing, what, keys = self._doing
             return [[f"{doing} {self.elapsed():.0f} s", *([what] if what else [])], [keys, self._called]]
@@ -142,7 +143,7 @@ class Progress:
         return [[*self._speed(row, time.monotonic() - came), steps, self._called], [KEYS, *self._summary(row)]]
 
     def _speed(self, row: Row, since: float) -> list[str]:
-        """Share of the steps that are done, time left, and steps per second."""
+        """Share of the steps done, time left, and steps per second; `since` the row [s]."""
         left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
         minutes, seconds = divmod(max(int(left), 0), 60)
         return [
@@ -152,20 +153,20 @@ class Progress:
         ]
 
     def _summary(self, row: Row) -> list[str]:
-        """The return and the first metrics behind it, of the evaluation or exploring, as far as there are any yet."""
+        """The return and the next two metrics, of the evaluation if there is one, else exploring."""
         evaluated = "eval_return" in row
-        chosen = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
-        first, *rest = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]
-        said = {first: first} | {name: name.removeprefix("eval_") for name in rest}
-        found = {text: row.get(name) for name, text in said.items()}
-        return [f"{text.replace('_', ' ')} {value:.4g}" for text, value in found.items() if value is not None]
+        names = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
+        first, *rest = names[:3] if evaluated else ["episode_return", *names[:2]]
+        labels = {first: first} | {name: name.removeprefix("eval_") for name in rest}
+        values = {label: row.get(name) for name, label in labels.items()}
+        return [f"{label.replace('_', ' ')} {value:.4g}" for label, value in values.items() if value is not None]
 
     def end_status(self) -> None:
-        """Take the status away: what comes is said line by line."""
+        """Remove the status; later output is printed line by line."""
         self._status.close()
 
     def close(self) -> None:
-        """Take the status away and close the files."""
+        """Remove the status and close the files."""
         self.end_status()
         if self._silent:
             return
@@ -174,9 +175,9 @@ class Progress:
 
 
 def _point(row: Mapping[str, str], began: float) -> Point:
-    """A row of `metrics.csv` of a run that began then [s]."""
-    numbers = {name: float(text) for name, text in row.items() if text}
-    return Point(int(row["steps"]), numbers, began + numbers["seconds"])
+    """A row of `metrics.csv` as a point; `began` is the wall-clock time of the run's start [s]."""
+    values = {name: float(text) for name, text in row.items() if text}
+    return Point(int(row["steps"]), values, began + values["seconds"])
 
 
 def _rows_until(path: Path, names: Sequence[str], steps: int) -> list[dict[str, str]]:

@@ -1,7 +1,7 @@
-"""What a training takes at the least, from its settings alone; what cannot fit is refused before it compiles.
+"""Lower bounds of a training's memory and steps from its settings, to refuse before compilation what cannot run.
 
-Lower bounds: nothing that would work is refused. What they leave out (temporary arrays, other programs) is noticed
-later, see `mjxball.xla.explained`.
+As lower bounds they refuse nothing that would work. They omit temporary arrays and other programs; if memory runs out
+later, `mjxball.xla.explained` reports it.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
 from mjxball.errors import InputError
 from mjxball.xla import room_in_address_space
 
-NUMBER = 4  # [B] of one number
-STATE = 100  # numbers of an environment: two drones, a load, what the follower remembers
-ROW = 2 * OBSERVATION_SIZE + ACTION_SIZE + 3  # numbers of a recorded step
-COPIES = 2  # of the whole state: it trains on while a checkpoint of it is written
-PROGRAM = 0.5e9  # [B] of compiling and running the smallest training, beyond what imports have taken
+NUMBER = 4  # size of a float32 [B]
+STATE = 100  # floats of an environment's state: two drones, a load, the follower's memory
+ROW = 2 * OBSERVATION_SIZE + ACTION_SIZE + 3  # floats of a recorded step
+COPIES = 2  # of the whole state: training continues while a checkpoint is written
+PROGRAM = 0.5e9  # memory to compile and run the smallest training, beyond that of imports [B]
 MOST_STEPS = 2**31 - 1  # environment steps are counted in 32 bits
 
 
 class Required(NamedTuple):
-    """At the least, for all members."""
+    """Lower bounds for a training."""
 
-    memory: float  # [B] on all devices together
+    memory: float  # of all members, on all devices together [B]
     steps: int  # environment steps of each member
 
 
 def required(config: Config, algorithm: str, members: int) -> Required:
-    """What `members` followers take, trained by `sac`, `ppo` or `gradient`."""
-    of = {"sac": _sac, "ppo": _ppo, "gradient": _gradient}[algorithm]
-    steps, state, data = of(config)
+    """Lower bounds for `members` followers trained by `sac`, `ppo` or `gradient`."""
+    sizes = {"sac": _sac, "ppo": _ppo, "gradient": _gradient}[algorithm]
+    steps, state, data = sizes(config)
     return Required(NUMBER * members * (COPIES * state + data), steps)
 
 
@@ -45,13 +45,13 @@ def _weights(inputs: int, layers: Sequence[int], outputs: int) -> int:
 
 
 def _policy(config: Config, layers: Sequence[int]) -> int:
-    """Weights of a policy, whose GRU's state the first and the last layer see as well."""
+    """Number of weights of a policy. Its first and last layer also take the GRU's state."""
     units, outputs = config.follower.recurrent_units, 2 * ACTION_SIZE
     gru = 3 * units * (OBSERVATION_SIZE + units + 1)
     return gru + _weights(OBSERVATION_SIZE + units, layers, outputs) + units * outputs
 
 
-# Each: environment steps, numbers of the state, of other arrays.
+# (environment steps, floats of the state, floats of other arrays)
 _Sizes = tuple[int, float, float]
 
 
@@ -76,13 +76,13 @@ def _ppo(config: Config) -> _Sizes:
 def _gradient(config: Config) -> _Sizes:
     gradient = config.gradient
     policy = _policy(config, gradient.policy_layers)
-    kept = sum(gradient.policy_layers) + 4 * config.follower.recurrent_units + STATE  # of every step, for the way back
+    stored = sum(gradient.policy_layers) + 4 * config.follower.recurrent_units + STATE  # per step, for backpropagation
     data = gradient.num_envs * gradient.horizon
-    return gradient.gradient_steps * data, 3 * policy + gradient.num_envs * STATE, data * kept
+    return gradient.gradient_steps * data, 3 * policy + gradient.num_envs * STATE, data * stored
 
 
 def check(config: Config, algorithm: str, members: int) -> None:
-    """Refuse by InputError, with the numbers, what this computer's memory or 32 bits do not hold."""
+    """Raise InputError if the training needs more memory than is free, or more steps than 32 bits can count."""
     needs = required(config, algorithm, members)
     if needs.steps > MOST_STEPS:
         raise InputError(f"the run has {needs.steps:.3g} environment steps, and {MOST_STEPS:.3g} can be counted")
@@ -95,14 +95,14 @@ def check(config: Config, algorithm: str, members: int) -> None:
 
 
 def _largest(config: Config, algorithm: str) -> str:
-    """Names of the settings that make a run large."""
-    own = getattr(config, algorithm)
+    """Names of the settings on which the memory of a run depends most, for an error message."""
+    settings = getattr(config, algorithm)
     names = ("num_envs", "replay_size", "batch_size", "horizon", "unroll_length", "policy_layers", "critic_layers")
-    return ", ".join(f"{algorithm}.{name}" for name in names if hasattr(own, name)) + " or --num-seeds"
+    return ", ".join(f"{algorithm}.{name}" for name in names if hasattr(settings, name)) + " or --num-seeds"
 
 
 def room_for_arrays() -> tuple[float, str]:
-    """Memory for arrays on JAX's devices [B], and where."""
+    """(free memory for arrays on JAX's devices [B], phrase that says what limits it)."""
     devices: list[Any] = jax.local_devices()
     limits = [(device.memory_stats() or {}).get("bytes_limit") for device in devices]
     if devices[0].platform != "cpu":
@@ -115,14 +115,14 @@ def room_for_arrays() -> tuple[float, str]:
 
 
 def _available() -> float:
-    """What the kernel would give without ending programs, swap included [B]."""
-    found = {line.split(":")[0]: line.split()[1] for line in _lines(Path("/proc/meminfo"))}
-    known = [float(found[name]) * 1024 for name in ("MemAvailable", "SwapFree") if name in found]
-    return sum(known) if "MemAvailable" in found else float("inf")
+    """Available memory of the machine, swap included [B]; infinite if unknown."""
+    table = {line.split(":")[0]: line.split()[1] for line in _lines(Path("/proc/meminfo"))}
+    known = [float(table[name]) * 1024 for name in ("MemAvailable", "SwapFree") if name in table]
+    return sum(known) if "MemAvailable" in table else float("inf")
 
 
 def _left_of_group() -> float:
-    """What a container or a job of a cluster may still take [B]."""
+    """Memory left in the process's control group, of a container or a cluster's job [B]; infinite without a limit."""
     least = float("inf")
     for folder, limit, used in (
         (Path("/sys/fs/cgroup"), "memory.max", "memory.current"),

@@ -33,22 +33,25 @@ from mjxball.train.progress import Progress, Row, Start, columns, started
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 from mjxball.train.stretch import advance
 
-SAVE_EVERY = 60.0  # [s] after which the next row brings a checkpoint, besides those of evaluations
+SAVE_EVERY = 60.0  # [s] since the last checkpoint after which the next row is followed by one
 
 
 @dataclass
 class Stop:
-    """Set by the first Ctrl-C; training then ends after the collection in flight, of several processes the chunk."""
+    """Request to stop, set by the first Ctrl-C.
+
+    Training ends after the current collection; with several processes, after the current chunk.
+    """
 
     requested: bool = False
-    begun: bool = False  # there is something to save
+    begun: bool = False  # training has begun, so there is a state to save
 
 
 @contextlib.contextmanager
 def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
-    """Turn the first Ctrl-C or SIGTERM into a request to stop; before training, or at a Ctrl-C after it, act at once.
+    """Turn the first Ctrl-C or SIGTERM into a request to stop. Before training, and at the second Ctrl-C, exit at once.
 
-    SLURM sends SIGTERM twice to what it preempts: to the process and, forwarded by srun, again.
+    A second SIGTERM is ignored: SLURM sends it twice to preempted jobs, once directly and once through srun.
     """
     stop = Stop()
     defaults = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -65,8 +68,8 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
             progress.end_status()
             progress.say("stopped before training began; --resume begins it")
             lock.drop()
-            os._exit(130)  # what XLA compiles cannot be cut short
-        progress.end_status()  # a second one leaves no time to
+            os._exit(130)  # XLA's compilation cannot be interrupted
+        progress.end_status()  # now, because a second Ctrl-C exits at once
         progress.say("stopping: saving the policy and a checkpoint (Ctrl-C again to quit at once)")
 
     for number in defaults:
@@ -79,20 +82,20 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
 
 @dataclass
 class Chunk:
-    """Training that the devices were given, and what it will have brought: a row of metrics.csv."""
+    """Training submitted to the devices, and its results, which become a row of metrics.csv."""
 
-    steps: int  # of every environment
-    reached: int  # environment steps of the run at its end
-    began: float  # [s] on the run's clock
-    ended: Future[float]  # [s] when the devices are done
+    steps: int  # of each environment
+    reached: int  # environment steps of the run at the chunk's end
+    began: float  # time of submission since the run's start [s]
+    ended: Future[float]  # time when the devices finish [s]
     statistics: Statistics  # on the devices
     metrics: Any
 
 
 class Run:
-    """Followers being trained into a run directory, by `mjxball.train.loop.train`.
+    """A training with its run directory, driven by `mjxball.train.loop.train`.
 
-    Of several processes each makes the same `Run`; only the first writes and prints.
+    With several processes each makes the same `Run`; only process 0 writes and prints.
     """
 
     def __init__(
@@ -103,10 +106,10 @@ class Run:
         resumed: TrainState | None,
         tracker: Start | None = None,
     ):
-        """`resumed` is None for a run that starts. `tracker`: see `mjxball.train.progress.Start`.
+        """`resumed`: the state to continue from, None for a new run. `tracker`: see `mjxball.train.progress.Start`.
 
-        `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name. A run that
-        starts takes the network of the policy `origin["start_from"]`, if that is there; each member its own of a list.
+        `origin` holds seed, physics, seeds (number of members) and sweep, and goes into the metadata of the policy. A
+        new run starts from the policy `origin["start_from"]` if there is one, or each member from its entry of a list.
         """
         self.config, self.out = config, out
         self._starts = starts_of(origin)
@@ -132,7 +135,7 @@ class Run:
         sessions = [session(self.population.member_config(k), seed + k, 1, origin) for k in range(count)]
         self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
-        self._clock = ThreadPoolExecutor(1)  # sees when the devices are done
+        self._clock = ThreadPoolExecutor(1)  # waits for the devices to take the time
         self._checkpoints: Future[Any] | None = None
         self._pending: Future[None] | None = None
         self._state = resumed
@@ -141,7 +144,7 @@ class Run:
 
     @property
     def state(self) -> TrainState:
-        """What is trained; there is none before `start` unless the run was resumed."""
+        """Training state. RuntimeError before `start`, unless the run was resumed."""
         if self._state is None:
             raise RuntimeError("the run has not started")
         return self._state
@@ -151,7 +154,7 @@ class Run:
         self._state = state
 
     def start(self) -> None:
-        """Compile, and make what is trained, or place what was resumed."""
+        """Compile, and create the initial state, or place the resumed state on the devices."""
         devices = self.population.devices
         what = f"the training program for {devices} x {jax.devices()[0].device_kind}"
         self.progress.begin("compiling", what, "Ctrl-C stops")
@@ -165,13 +168,13 @@ class Run:
         else:
             self.state = self.population.place_state(self.state)
         self._compiled.wait()
-        if self._writes:  # Orbax takes a second to load: while the device trains, not before
+        if self._writes:  # Orbax takes a second to import, which overlaps with training here
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
         self.progress.begin("training")
 
     def end(self, finished: bool) -> None:
-        """Save, keep of the checkpoints the newest if training has `finished`, and say what it took."""
+        """Save, delete all but the newest checkpoint if training has `finished`, and print time and memory."""
         self.save()
         if self._pending and finished:
             self._pending = self._writer.submit(_keep_newest, self._pending, self._checkpoints)
@@ -188,7 +191,7 @@ class Run:
                     self._checkpoints.result().close()
 
     def _cost(self) -> str:
-        """What the run took, for people and for `benchmarks/training.py`."""
+        """Peak memory and time of the run as a sentence, which `benchmarks/training.py` parses."""
         host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
         device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
         more = f", {device / 1e6:.0f} MB on each device" if device else ""
@@ -196,11 +199,11 @@ class Run:
 
     @property
     def done(self) -> int:
-        """Steps that every environment has taken, the warm-up with them."""
+        """Steps that each environment has taken, including the warm-up."""
         return self._reached // self._schedule.num_envs
 
     def advance(self, mode: Mode, pause: Callable[[], bool] = lambda: False) -> Chunk:
-        """Give the devices a stretch of work, behind that they are at, or part of it if there is to be a `pause`."""
+        """Submit the steps of `mode` to the devices; fewer if `pause` returns true."""
         began = self.progress.elapsed()
         self.state, statistics, metrics, taken = advance(self.population, self._compiled, self.state, mode, pause)
         ended = self._clock.submit(lambda: (jax.block_until_ready(statistics), self.progress.elapsed())[1])
@@ -208,11 +211,11 @@ class Run:
         return Chunk(taken, self._reached, began, ended, statistics, metrics)
 
     def saved_long_ago(self) -> bool:
-        """Whether a checkpoint is due for time alone."""
+        """Whether the last checkpoint is older than `SAVE_EVERY`."""
         return self.progress.elapsed() - self._saved_at > SAVE_EVERY
 
     def row(self, chunk: Chunk) -> Row:
-        """What there is to say of a chunk, once the devices are done with it."""
+        """The row of metrics.csv for a chunk, after waiting for the devices. Raises TrainingDivergedError."""
         statistics, metrics = processes.gather((chunk.statistics, chunk.metrics))
         ended = chunk.ended.result()
         began, self._chunk_ended = max(chunk.began, self._chunk_ended), ended
@@ -236,46 +239,49 @@ class Run:
         }
 
     def evaluate(self) -> Row:
-        """Evaluate the policies, on the same fresh environments every time."""
-        population, kept = self.population, self.state
+        """Evaluate the policies, always on the same initial states; the columns of metrics.csv, medians over members.
+
+        Environments and keys of training are restored afterwards.
+        """
+        population, training = self.population, self.state
         steps = population.program.evaluation_steps
-        keys = processes.gather(kept.key)
+        keys = processes.gather(training.key)
         envs = population.evaluation_envs(self._compiled)
-        lent = kept._replace(envs=envs, key=population.place_keys(keys))
-        after, statistics, *_ = advance(population, self._compiled, lent, programs.evaluate(steps))
+        evaluated = training._replace(envs=envs, key=population.place_keys(keys))
+        after, statistics, *_ = advance(population, self._compiled, evaluated, programs.evaluate(steps))
         statistics = processes.gather(statistics)
-        self.state = after._replace(envs=kept.envs, key=population.place_keys(keys))
+        self.state = after._replace(envs=training.envs, key=population.place_keys(keys))
         reward, ended = population.each(statistics.reward), population.each(statistics.ended)
-        found = {"eval_return": population.program.evaluated_return(reward, ended)}
-        found |= {f"eval_{name}": values for name, values in population.report(statistics, steps, True).items()}
+        results = {"eval_return": population.program.evaluated_return(reward, ended)}
+        results |= {f"eval_{name}": values for name, values in population.report(statistics, steps, True).items()}
         if population.members > 1:
-            self.members.add(self._reached, found)
-        return {name: _median_or_none(values) for name, values in found.items()}
+            self.members.add(self._reached, results)
+        return {name: _median_or_none(values) for name, values in results.items()}
 
     def save(self) -> None:
-        """Write policy and checkpoint, if there is anything new; the checkpoint in a thread of its own."""
+        """Write policy and checkpoint, if there were steps since the last; the checkpoint in a separate thread."""
         began = self.progress.elapsed()
         if self._state is None or self._saved_steps == self._reached:
             return
         self._saved_steps = self._reached
         exported = self._export()
-        kept = self._snapshot()
+        snapshot = self._snapshot()
         if exported and self._checkpoints:
             if self._pending:
                 self._pending.result()
-            self._pending = self._writer.submit(_write, self._checkpoints, kept)
+            self._pending = self._writer.submit(_write, self._checkpoints, snapshot)
         self._saved_at = self.progress.elapsed()
         self._saving += self._saved_at - began
 
     def _snapshot(self) -> TrainState:
-        """A copy of the state: the next chunk of training reuses its buffers while it is still being written.
+        """A copy of the state to write, because the next chunk of training reuses its buffers.
 
-        It stays on the device, if that has room for it, and comes to the host in the thread that writes.
+        It stays on the device if that has room, and is copied to the host in the writing thread.
         """
-        shares = [leaf.nbytes / self.population.devices for leaf in jax.tree.leaves(self.state)]
+        sizes = [leaf.nbytes / self.population.devices for leaf in jax.tree.leaves(self.state)]  # on each device
         stats = jax.local_devices()[0].memory_stats() or {}
         room = stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
-        if jax.process_count() > 1 or 2 * sum(shares) > room:
+        if jax.process_count() > 1 or 2 * sum(sizes) > room:
             return processes.gather(self.state)
         return jax.device_put(self.state, jax.tree.map(lambda leaf: leaf.sharding, self.state), may_alias=False)
 
@@ -283,7 +289,7 @@ class Run:
         return self.members.policy_path(member) if self.population.members > 1 else self.out / POLICY
 
     def _export(self) -> bool:
-        """Write the policy file, of a population every member's and the best one's; False if none is sound."""
+        """Write the policy file, in a population every member's and that of the best; False if none is finite."""
         steps, exported = self._reached, False
         best = self.members.best()
         state = processes.gather(self.state._replace(envs=()))
@@ -296,7 +302,7 @@ class Run:
             if self._starts:
                 origin["start_from"] = self._starts[member % len(self._starts)]
             config = self.population.member_config(member)
-            if not is_pair(self.population.program.env):  # no policy file: its observation is another
+            if not is_pair(self.population.program.env):  # a policy file has the layout of our observation
                 exported |= network_file(self._network_path(member), learnt, steps, origin)
                 continue
             policy = policy_file(config, follower_law(config), learnt, steps, origin)
@@ -316,8 +322,8 @@ def _open_checkpoints(out: Path) -> Any:
     return Checkpoints(out)
 
 
-def _write(checkpoints: Future[Any], kept: TrainState) -> None:
-    checkpoints.result().save(processes.gather(kept))
+def _write(checkpoints: Future[Any], state: TrainState) -> None:
+    checkpoints.result().save(processes.gather(state))
 
 
 def _keep_newest(written: Future[None], checkpoints: Future[Any] | None) -> None:
@@ -338,6 +344,6 @@ def _median(values: np.ndarray) -> float:
 
 
 def _median_or_none(values: np.ndarray) -> float | None:
-    """`_median`, None if there was nothing to count."""
-    middle = _median(values)
-    return None if math.isnan(middle) else middle
+    """`_median`, or None in place of NaN."""
+    median = _median(values)
+    return None if math.isnan(median) else median

@@ -1,6 +1,6 @@
-"""The files of a run directory: configuration and sweep, and the versions and source that made the run.
+"""Files of a run directory: configuration, sweep and tables, and the versions and source that made the run.
 
-They are read as if a stranger had written them: one sentence for whatever is wrong."""
+Readers validate everything: a damaged file raises InputError with one sentence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LONGEST_COUNT = 20  # digits of a number of steps
 def read_json(path: Path, called: str) -> Any:
     """The contents of a JSON file; MissingFileError if there is none, InputError if it cannot be read.
 
-    `called` says in the error what the file is, '' for nothing but its path.
+    `called` describes the file in the error; with '' the error contains its path alone.
     """
     text = read_text(path, called)
     try:
@@ -43,7 +43,7 @@ def read_json(path: Path, called: str) -> Any:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file with a header; a row that is cut short or too long is left out.
+    """The rows of a CSV file with a header. Rows with too few or too many values are left out.
 
     MissingFileError if there is no such file, InputError if it cannot be read or has a column twice.
     """
@@ -59,9 +59,9 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def read_metrics(path: Path) -> list[dict[str, str]]:
-    """The rows of `metrics.csv` whose steps follow each other; stderr says what was left out. Errors as `read_rows`.
+    """The rows of `metrics.csv` with increasing steps; a warning on stderr counts the others. Errors as `read_rows`.
 
-    A row that stands twice or goes back is what another process wrote, or is left of a run that was cut short.
+    A row whose steps do not increase comes from another process, or from a run that was interrupted.
     """
     rows = read_rows(path)
     kept: list[dict[str, str]] = []
@@ -89,12 +89,12 @@ def _refusal(path: Path, called: str, why: object) -> InputError:
     return InputError(f"{called}{' ' if called else ''}{path} cannot be read: {words}")
 
 
-# What a run directory holds.
+# Names in a run directory.
 CONFIG_FILE, METRICS, POLICY, CHECKPOINTS = "config.json", "metrics.csv", "policy.npz", "checkpoints"
-EXTENSIONS = ("env", "reward", "algorithm")  # what a run may use of the user's own, by name
+EXTENSIONS = ("env", "reward", "algorithm")  # flags that name the user's code, see `mjxball.train.extensions`
 MOST_MEMBERS = 4096
 LARGEST_SEED = 2**31 - 1
-ORIGIN = ("seed", "physics", "seeds", "sweep")  # what it must say beside the configuration
+ORIGIN = ("seed", "physics", "seeds", "sweep")  # required keys of config.json besides the configuration
 
 
 def _is_whole(value: Any, low: int, high: int) -> bool:
@@ -107,22 +107,22 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     contents = load_file(path)
     if file_hash(path) != start["sha256"]:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
-    own = parse_json(json.dumps(configs.to_dict(config)["follower"]))
+    needed = parse_json(json.dumps(configs.to_dict(config)["follower"]))
     trained = contents.card.get("config", {}).get("follower", {})
-    changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
+    changed = [f"follower.{name}" for name in needed if needed[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
     return contents
 
 
 def starts_of(origin: Mapping[str, Any]) -> list[dict[str, str]]:
-    """What a run with that `origin` starts from, each for `start_policy`: one file for all members or one for each."""
+    """Arguments of `start_policy` for a run with this `origin`: one for all members, one for each, or none."""
     start = origin.get("start_from") or []
     return start if isinstance(start, list) else [start]
 
 
 def members_of(run: Path) -> list[Path]:
-    """The policies of all members of a population, by their seeds; InputError if there are none."""
+    """Policy files of all members of a population, sorted by seed; InputError if there are none."""
     found = [(int(path.stem[4:]), path) for path in (run / "members").glob("seed*.npz") if path.stem[4:].isdecimal()]
     if not found:
         raise InputError(f"{run} holds no population: train.py --num-seeds writes members/seed*.npz")
@@ -141,7 +141,7 @@ def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
 
 
 def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
-    """Configuration and origin of a run directory; raise InputError if it is none."""
+    """(configuration, origin) of a run directory. Raises InputError unless config.json is complete and unchanged."""
     path = run / CONFIG_FILE
     try:
         record = read_json(path, "")
@@ -152,7 +152,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     settings = record.pop("config")
     try:
         config = configs.from_dict(settings)
-    except (TypeError, OverflowError) as error:  # a value of another kind than any setting, a number beyond all floats
+    except (TypeError, OverflowError) as error:  # a value of a wrong type, or a number too large for a float
         raise InputError(f"{path} holds no configuration: {error}") from None
     lost = [name for name in ORIGIN if name not in record]
     if lost:
@@ -168,7 +168,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
 
 
 PACKAGE = Path(__file__).parents[1]
-# What a training result depends on; evaluation and the flight code are not among it.
+# Source that a training result depends on, without evaluation and flight.
 SOURCES = (
     "config",
     "assembly.py",
@@ -210,7 +210,7 @@ def versions() -> dict[str, str]:
 def commit() -> str:
     """The commit of the source tree, marked `-dirty` if it has changes, or 'unknown' outside a repository.
 
-    `MJXBALL_COMMIT` overrules it, for containers and copied trees.
+    The variable `MJXBALL_COMMIT` takes precedence, for containers and copied trees.
     """
     if given := os.environ.get("MJXBALL_COMMIT"):
         return given
@@ -222,7 +222,7 @@ def commit() -> str:
 
 
 def differences(recorded: Mapping[str, Any]) -> list[str]:
-    """How this program differs from the one that made a run with the origin `recorded`, one phrase each."""
+    """Differences, one phrase each, between this program and the one that made a run with the origin `recorded`."""
     found = []
     if recorded.get("source_hash") != source_hash():
         found.append(f"source {recorded.get('source_hash')} (commit {recorded.get('commit')}) is now {source_hash()}")
@@ -233,7 +233,7 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
     return found
 
 
-# Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
+# Settings that can be traced: real-valued ones of algorithms and reward, and the follower's action scales.
 SWEEPABLE = (
     *(
         path
@@ -247,12 +247,12 @@ Sweep = Mapping[str, Sequence[float]]
 
 
 def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float]]:
-    """A sweep file: JSON {"<config path>": [one number for each member], ...}. Raises InputError if unsound."""
+    """A sweep file: JSON {"<config path>": [one number for each member], ...}. Raises InputError if invalid."""
     return check_sweep(read_json(path, "sweep file"), members, config, f"sweep file {path}")
 
 
 def check_sweep(sweep: Any, members: int, config: Config, where: str) -> dict[str, list[float]]:
-    """`sweep` itself; InputError that begins with `where` unless it fits the members."""
+    """`sweep`, unchanged. Raises InputError, which begins with `where`, unless it is valid for so many `members`."""
     if not isinstance(sweep, dict) or not sweep:
         raise InputError(f"{where} must hold an object of settings")
     for name, values in sweep.items():

@@ -1,4 +1,4 @@
-"""A population trained in equal parts, each a run of its own: what a part trains, and all of them brought together."""
+"""Shares: a population trained in equal parts, each a separate run, and gathered afterwards."""
 
 from __future__ import annotations
 
@@ -12,15 +12,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, load_file, save_file
 from mjxball.train.curves import LOG, POLICIES, best_member, read_members
-from mjxball.train.run_directory import (
-    METRICS,
-    MOST_MEMBERS,
-    POLICY,
-    members_of,
-    read_config,
-    read_metrics,
-    write_rows,
-)
+from mjxball.train.run_directory import METRICS, MOST_MEMBERS, POLICY, members_of, read_config, read_metrics, write_rows
 
 SAME = ("physics", "seeds", "source_hash", "versions", "extensions", "extension_hash")
 
@@ -34,25 +26,26 @@ def read(text: str) -> tuple[int, int]:
 
 
 def take(origin: dict[str, Any], index: int, number: int) -> None:
-    """Leave of the population that `origin` describes the part `index` of `number`, and note which it is.
+    """Reduce the population that `origin` describes to the part `index` of `number`, and record both in `origin`.
 
-    Raises InputError if the members cannot be divided equally: parts of one size share one compiled program.
+    Raises InputError if the members cannot be divided equally: parts of equal size share one compiled program.
     """
     count, rest = divmod(origin["seeds"], number)
     if rest:
         raise InputError(f"--num-seeds {origin['seeds']} cannot be divided into {number} equal shares")
-    own = slice(index * count, (index + 1) * count)
+    members = slice(index * count, (index + 1) * count)
     if origin["sweep"] is not None:
-        origin["sweep"] = {name: values[own] for name, values in origin["sweep"].items()}
+        origin["sweep"] = {name: values[members] for name, values in origin["sweep"].items()}
     if isinstance(origin.get("start_from"), list):
-        origin["start_from"] = origin["start_from"][own]
-    origin |= {"seed": origin["seed"] + own.start, "seeds": count, "share": [index, number]}
+        origin["start_from"] = origin["start_from"][members]
+    origin |= {"seed": origin["seed"] + members.start, "seeds": count, "share": [index, number]}
 
 
 def gather(runs: Sequence[Path], out: Path) -> tuple[Config, dict[str, Any]]:
-    """Write `members/`, `members.csv` and the best member's `policy.npz` of all `runs` to `out`; whose they are.
+    """Write `members/`, `members.csv` and the best member's `policy.npz` of all `runs` to `out`.
 
-    Raises InputError unless they are all parts of one population, each trained to its end.
+    Returns (configuration, origin) of the whole population. Raises InputError unless `runs` are all parts of one
+    population, each trained to its end.
     """
     found: dict[int, tuple[Path, Config, dict[str, Any]]] = {}
     for run in runs:
@@ -79,6 +72,7 @@ def gather(runs: Sequence[Path], out: Path) -> tuple[Config, dict[str, Any]]:
 
 
 def _share(run: Path, origin: dict[str, Any]) -> tuple[int, int]:
+    """(index, number) of the share that `run` trained. Raises InputError if it trained none."""
     share = origin.get("share")
     if (
         not isinstance(share, list)
@@ -95,16 +89,16 @@ def _share(run: Path, origin: dict[str, Any]) -> tuple[int, int]:
 
 
 def _refuse_unlike(parts: Sequence[tuple[Path, Config, dict[str, Any]]]) -> None:
-    """InputError unless all `parts` are of one population."""
-    told = [_told(settings, origin) for _, settings, origin in parts]
-    for (run, *_), own in zip(parts, told, strict=True):
-        unlike = [name for name, value in own.items() if value != told[0][name]]
+    """Raise InputError unless all `parts` are of one population."""
+    records = [_common(settings, origin) for _, settings, origin in parts]
+    for (run, *_), record in zip(parts, records, strict=True):
+        unlike = [name for name, value in record.items() if value != records[0][name]]
         if unlike:
             raise InputError(f"{run} is of another population than {parts[0][0]}: they differ in {', '.join(unlike)}")
 
 
-def _told(settings: Config, origin: dict[str, Any]) -> dict[str, Any]:
-    """What is the same in all parts of one population."""
+def _common(settings: Config, origin: dict[str, Any]) -> dict[str, Any]:
+    """Values that must be equal in all parts of one population."""
     index, number = origin["share"]
     return {
         **{name: origin.get(name) for name in SAME},
@@ -116,7 +110,7 @@ def _told(settings: Config, origin: dict[str, Any]) -> dict[str, Any]:
 
 
 def _evaluations(run: Path, origin: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of `members.csv`, which a run of one member does not have. InputError unless the run came to its end."""
+    """Rows of `members.csv`; those of a run of one member come from `metrics.csv`. InputError for an unfinished run."""
     rows: list[dict[str, Any]] = list(read_members(run))
     if origin["seeds"] == 1:
         try:
@@ -131,13 +125,13 @@ def _evaluations(run: Path, origin: dict[str, Any]) -> list[dict[str, Any]]:
             ]
         except (KeyError, ValueError):
             raise InputError(f"{run / METRICS} is damaged: it holds what is no number") from None
-    if not rows or not (run / "eval").is_dir():  # which is made then
+    if not rows or not (run / "eval").is_dir():  # created when training ends
         raise InputError(f"{run} was not trained to its end; say --resume {run}")
     return rows
 
 
 def _policies(run: Path, origin: dict[str, Any]) -> dict[int, PolicyFile]:
-    """The policy of every seed."""
+    """Policy files by seed. Raises InputError unless every seed of the run has one."""
     files = [run / POLICY] if origin["seeds"] == 1 else members_of(run)
     policies: dict[Any, PolicyFile] = {policy.card.get("seed"): policy for policy in map(load_file, files)}
     seeds = range(origin["seed"], origin["seed"] + origin["seeds"])

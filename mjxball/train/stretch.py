@@ -1,4 +1,4 @@
-"""A stretch of training on the devices, of any algorithm: collect, update."""
+"""Several steps of training on the devices with any algorithm: collect, update, repeat."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from mjxball.train.program import Mode, Statistics, TrainState
 
 
 class Stretch(NamedTuple):
-    """What `advance` returns."""
+    """Result of `advance`."""
 
     state: TrainState
     statistics: Statistics
     metrics: Any  # of the last update
-    steps: int  # of every environment
+    steps: int  # taken by each environment
 
 
 def advance(
@@ -25,9 +25,9 @@ def advance(
     mode: Mode,
     pause: Callable[[], bool] = lambda: False,
 ) -> Stretch:
-    """Step all environments `mode.steps` times, rounded up to whole collections, and learn; fewer if `pause` says so.
+    """Step all environments `mode.steps` times, rounded up to whole collections, and learn; stop if `pause` is true.
 
-    Results are there before the devices are done with them, unless they are CPUs. The arrays of `state` are used up.
+    On accelerators it returns before the devices are done. The buffers of `state` are donated.
     """
     phase, window = population.place_phase(mode.phase), population.program.algorithm.steps_per_collect
     carried = Carried(state, population.no_statistics())

@@ -1,1 +1,1 @@
-"""A flight in the browser: `python -m mjxball.view RUN_OR_FLIGHT`."""
+"""Viewer of flights in the browser: `python -m mjxball.view RUN_OR_FLIGHT`."""

@@ -1,6 +1,6 @@
-"""A flight to play: recorded in a file, or flown on the spot.
+"""Flights to play, read from a file or simulated.
 
-The file is one `.npz` without pickles; reading verifies everything it uses.
+The file is one `.npz` without pickles; reading verifies everything that it uses.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20
-STEPS = (1e-4, 1.0)  # [s] between two rows, as a rule
+STEPS = (1e-4, 1.0)  # usual range of the time between two rows [s]
 KINDS = ("phase", "fault", "end")  # of marks
 LEVELS = ("", "good", "bad")
 
 
 class Mark(NamedTuple):
-    """Something on the time axis: a phase, which lasts until the next one, a fault, or the end."""
+    """A mark on the time axis: a phase, which lasts until the next one, a fault, or the end."""
 
     time: float  # [s]
     kind: str
@@ -47,7 +47,7 @@ class Mark(NamedTuple):
 
 
 def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
-    """What is shown of a `rollout.Trajectory`, and the shape of a row."""
+    """Arrays of a `rollout.Trajectory` that the viewer shows, with the shape of a row."""
     drones, followers = plant.count, plant.count - 1
     return {
         "time": (),
@@ -69,26 +69,26 @@ def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
 class Flight:
     """One flight of T rows: arrays (T, ...) in SI units, named and laid out as in `rollout.Trajectory`.
 
-    `hidden` (T, [followers,] H), the state of the followers' GRU after each row, is there if it was asked for.
+    The array `hidden` (T, [followers,] H), the state of the followers' GRU after each row, is optional.
     """
 
     title: str
     plant: Plant
     arrays: dict[str, np.ndarray]
-    marks: tuple[Mark, ...] = ()  # of a flight that was really flown
+    marks: tuple[Mark, ...] = ()  # of a flight on hardware or the twin
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.arrays[name]
 
 
 def flight_of(trajectory: Trajectory, plant: Plant, title: str, hidden: np.ndarray | None = None) -> Flight:
-    """A single recorded `trajectory` as a flight."""
+    """A `trajectory` without a batch axis as a flight."""
     arrays = {name: np.asarray(getattr(trajectory, name), float) for name in shapes(plant)}
     return Flight(title, plant, arrays if hidden is None else {**arrays, "hidden": hidden})
 
 
 def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
-    """Write `flight` to `path`, whole or not at all."""
+    """Write `flight` to `path` atomically."""
     about = {"format": FORMAT, "title": flight.title, "plant": configs.to_dict(flight.plant), "marks": flight.marks}
     stream = BytesIO()
     arrays: dict[str, Any] = {name: array.astype(np.float32) for name, array in flight.arrays.items() if name != "time"}
@@ -97,7 +97,7 @@ def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
 
 
 def load_flight(path: str | os.PathLike[str]) -> Flight:
-    """Read and verify a flight; raise InputError with one sentence on anything unsound."""
+    """Read and verify a flight. Raises InputError, with one sentence, if it is invalid."""
     arrays: dict[str, Any] = dict(read_arrays(str(path), "flight", MAX_BYTES))
     try:
         about = parse_json(str(arrays.pop("about")))
@@ -112,7 +112,7 @@ def load_flight(path: str | os.PathLike[str]) -> Flight:
 
 
 def read_marks(values: Any) -> tuple[Mark, ...]:
-    """Marks as a flight file has them. Raises ValueError or TypeError if they are none."""
+    """Marks from their values in a flight file. Raises ValueError or TypeError if these are invalid."""
     marks = tuple(Mark(float(t), str(kind), str(text)[:500], str(level)) for t, kind, text, level in values[:1000])
     if any(mark.kind not in KINDS or mark.level not in LEVELS or not abs(mark.time) < 1e9 for mark in marks):
         raise ValueError
@@ -120,31 +120,31 @@ def read_marks(values: Any) -> tuple[Mark, ...]:
 
 
 def check_flight(flight: Flight, name: str) -> Flight:
-    """`flight` if every array has its shape and is finite and time runs, else InputError."""
+    """`flight`. Raises InputError unless every array has its shape and is finite, and time increases."""
     rows = np.shape(flight.arrays.get("time", 0.0))
     if len(rows) != 1 or rows[0] < 2:
         raise InputError(f"{name}: a flight needs a time of at least two rows")
-    wanted = shapes(flight.plant)
+    expected = shapes(flight.plant)
     if "hidden" in flight.arrays:
-        own = np.shape(flight["hidden"])
-        wanted["hidden"] = (*wanted["follower_command"][:-1], own[-1] if own and own[-1] else 1)
-    for field, shape in wanted.items():
+        hidden = np.shape(flight["hidden"])
+        expected["hidden"] = (*expected["follower_command"][:-1], hidden[-1] if hidden and hidden[-1] else 1)
+    for field, shape in expected.items():
         array = flight.arrays.get(field)
         if array is None or array.dtype.kind != "f" or array.shape != rows + shape:
             raise InputError(f"{name}: {field} is missing or not of shape {rows + shape}")
         if not np.isfinite(array).all():
             raise InputError(f"{name}: {field} holds a value that is not finite")
     try:
-        told = check_times(flight["time"].tolist(), *STEPS)
+        warnings = check_times(flight["time"].tolist(), *STEPS)
     except ValueError as error:
         raise InputError(f"{name}: time must increase from row to row: {error}") from None
-    for phrase in told:
+    for phrase in warnings:
         warn(f"warning: {name}: {phrase}")
-    return dataclasses.replace(flight, arrays={field: flight[field] for field in wanted})
+    return dataclasses.replace(flight, arrays={field: flight[field] for field in expected})
 
 
 def is_flight(path: Path) -> bool:
-    """True if `path` looks like a flight's file rather than a policy's."""
+    """Whether the `.npz` file `path` has the entries of a flight, not of a policy."""
     try:
         with zipfile.ZipFile(path) as archive:
             return "about.npy" in archive.namelist()
@@ -164,31 +164,31 @@ def flight_from(
     hidden: bool = False,
     read_other: Callable[[Path], Flight] = _unknown,
 ) -> Flight:
-    """The flight that `source` names; with `hidden`, what its follower's GRU remembers as well.
+    """The flight that `source` names; with `hidden` also the state of its follower's GRU.
 
-    A flight file is read, and any file that is no .npz by `read_other`. A policy file, a run directory (its
-    `policy.npz`), the name of a classical follower or module:Class, one's own, is flown through its reference scenario
-    with `changes` to the fields of `Scenario`, on the paper's plant; a policy made for Crazyflies on its own; or on
-    `plant`, a plant file or a shipped one's name. Raises InputError if it is none of these, or has no GRU where its
-    state is asked for.
+    A flight file is read, and a file that is no .npz by `read_other`. A policy file, a run directory (its
+    `policy.npz`), the name of a classical follower or the user's module:Class is simulated on its reference scenario,
+    with `changes` to fields of `Scenario`. The plant is `plant`, a file or a shipped plant's name; by default the
+    paper's, or a Crazyflie policy's. Raises InputError if `source` is none of these, or has no GRU although `hidden`.
     """
     path = Path(source)
     if path.suffix == ".npz" and path.is_file() and is_flight(path):
-        found = load_flight(path)
+        flight = load_flight(path)
     elif path.is_file() and path.suffix != ".npz":
-        found = read_other(path)
+        flight = read_other(path)
     else:
-        found = _flown(source, changes, physics, plant, hidden)
-    if hidden and "hidden" not in found.arrays:
+        flight = _simulated(source, changes, physics, plant, hidden)
+    if hidden and "hidden" not in flight.arrays:
         raise InputError(f"{source} holds no state of a recurrent network that could be shown")
-    return found if hidden else dataclasses.replace(found, arrays=_without_hidden(found.arrays))
+    return flight if hidden else dataclasses.replace(flight, arrays=_without_hidden(flight.arrays))
 
 
 def _without_hidden(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: array for name, array in arrays.items() if name != "hidden"}
 
 
-def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:
+def _simulated(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:
+    """The simulated flight of the follower `source`, see `flight_from`."""
     from mjxball.baselines import LAWS
     from mjxball.evaluate.followers import find_follower
     from mjxball.evaluate.policies import load_policy, native_config
@@ -210,27 +210,28 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
     scenario = dataclasses.replace(standard_scenarios(setup)[0], **tuples)
     if "mass" in changes:
         configs.check_lift(setup, changes["mass"])
-    flown = simulate(setup, follower, scenario, physics)
+    trajectory = simulate(setup, follower, scenario, physics)
     reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
     motion = f"CG {reach}{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
     if setup.motion.kind == "rolling":
         motion = f"ball from {100 * scenario.ball_start:g} cm"
-    remembered = _remembered(follower, flown.observation) if hidden else None
-    return flight_of(flown, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg", remembered)
+    states = _hidden_states(follower, trajectory.observation) if hidden else None
+    return flight_of(trajectory, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg", states)
 
 
-def _remembered(follower: Any, observations: np.ndarray) -> np.ndarray | None:
-    """The state (T, [followers,] H) of the GRU of `follower` after each of `observations`; None if it has none."""
+def _hidden_states(follower: Any, observations: np.ndarray) -> np.ndarray | None:
+    """The state (T, [followers,] H) of the GRU of `follower` after each of `observations`; None without a GRU."""
     rows = []
     if hasattr(follower, "hidden"):
         follower.reset()
-        for seen in observations:
-            follower(seen)
+        for observation in observations:
+            follower(observation)
             rows.append(follower.hidden)
     return np.array(rows, float) if rows and rows[0] is not None else None
 
 
 def _policy_file(path: Path) -> Path:
+    """The policy file that `path` names: a file, a shipped policy's name, or a run directory. Raises InputError."""
     path = policy_path(path)
     if path.is_dir():
         if not (path / "policy.npz").exists():

@@ -16,16 +16,16 @@ from mjxball.view.flight import Flight, flight_from, save_flight
 from mjxball.view.page import flight_page
 
 VIDEOS = (".mp4", ".gif")
-CHANGES = ("omega", "amplitude", "mass", "goal", "seconds")  # flags, and fields of a scenario
+CHANGES = ("omega", "amplitude", "mass", "goal", "seconds")  # flags with the names of fields of a scenario
 
 
 def parser() -> Parser:
-    """The argument parser of `python -m mjxball.view`."""
+    """Argument parser of `python -m mjxball.view`."""
     return make_view_parser("python -m mjxball.view", "recorded flight (.npz)")
 
 
 def make_view_parser(name: str, recorded: str) -> Parser:
-    """The argument parser of the command `name`, which plays what is `recorded`."""
+    """Argument parser of the viewer command `name`; `recorded` describes the files that it plays."""
     about = "Play a flight in the browser: one HTML page that needs neither a server nor a network."
     result = make_parser(name, about)
     result.add_argument(
@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def show(options: argparse.Namespace, flight_from: Callable[..., Flight]) -> int:
-    """Play what `options` name, each read or flown by `flight_from`; return the exit code. Raises InputError."""
+    """Show the sources in `options`, each read or flown by `flight_from`; return the exit code. Raises InputError."""
     if len(options.source) > 2:
         raise InputError(f"two flights fit side by side, not {len(options.source)}")
     if options.speed is not None and not options.video:
@@ -75,7 +75,7 @@ def show(options: argparse.Namespace, flight_from: Callable[..., Flight]) -> int
     _check(options)
     given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
     flights = [flight_from(one, given, options.physics, options.plant, options.hidden) for one in options.source]
-    if len({flight.title for flight in flights}) < len(flights):  # else nobody could tell which is which
+    if len({flight.title for flight in flights}) < len(flights):  # equal titles would be ambiguous
         named = zip(options.source, flights, strict=True)
         flights = [dataclasses.replace(one, title=f"{Path(source).name}: {one.title}"[:200]) for source, one in named]
     if options.video:
@@ -94,7 +94,7 @@ def show(options: argparse.Namespace, flight_from: Callable[..., Flight]) -> int
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse what does not go together, before anything is flown."""
+    """Raise InputError for options that exclude each other or cannot be written, before anything is simulated."""
     if options.save and len(options.source) > 1:
         raise InputError("--save writes one flight: leave one of the two out")
     if options.speed is not None and not 0.01 <= options.speed <= 100:
@@ -112,5 +112,5 @@ def _video(flights: Sequence[Flight], suffix: str, speed: float) -> bytes:
     labels = [flight.title.partition(":")[0].partition(",")[0] for flight in flights]
     if len(set(labels)) < len(labels):
         labels = [f"{label} {number}" for number, label in enumerate(labels, 1)]
-    shown = {label: flight.arrays for label, flight in zip(labels, flights, strict=True)}
-    return render([flight.plant for flight in flights], shown, suffix, speed=speed)
+    arrays = {label: flight.arrays for label, flight in zip(labels, flights, strict=True)}
+    return render([flight.plant for flight in flights], arrays, suffix, speed=speed)

@@ -1,4 +1,4 @@
-"""The page around a flight: one HTML file that works from disk."""
+"""The viewer's page: one HTML file with the flights inside, which needs no server."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mjxball.plotting import BLUE, BROWN, GREEN, OLIVE, PINK, SKY
 from mjxball.view.flight import Flight
 
 PARTS = Path(__file__).parent / "parts"
-UNMEASURED = ("cg_offset", "object_mass", "contact_force")  # in a flight log
+UNMEASURED = ("cg_offset", "object_mass", "contact_force")  # absent from flight logs
 SHOWN = ("time", "position", "euler", "quaternion", "leader_command", "follower_command", "target", "hidden")
 SCRIPTS = ("space.js", "flight.js", "scene.js", "plots.js", "player.js", "controls.js")
 DRONES = {f"drone-{number}": colour for number, colour in enumerate(COLOURS)}  # the leader, then followers
@@ -28,13 +28,13 @@ SCENE = {"goal": GREEN, "cg": OLIVE, "thrust": SKY, "contact": PINK, "weight": B
 
 
 def flight_page(*flights: Flight) -> str:
-    """The page's text; the flights, one or two side by side, are inside, as float32."""
+    """The page's HTML with one flight, or two side by side, as float32."""
     title, contents = " | ".join(flight.title for flight in flights), [page_contents(one) for one in flights]
     return page_of(title, contents, PARTS / "recorded.js")
 
 
 def page_of(title: str, data: Any, start: Path) -> str:
-    """The viewer's page with `data` inside, begun by the script in the file `start`."""
+    """The viewer's HTML with `data` inside; the script in the file `start` creates the player."""
     script = "\n".join(path.read_text(encoding="utf-8") for path in (*(PARTS / name for name in SCRIPTS), start))
     colours = " ".join(f"--{name}: {colour};" for name, colour in (DRONES | AXES | SCENE | {"good": GREEN}).items())
     parts = {
@@ -44,14 +44,14 @@ def page_of(title: str, data: Any, start: Path) -> str:
         "script": script,
     }
     page = (PARTS / "page.html").read_text(encoding="utf-8")
-    # In one pass: what is put in is text, and a title may look like a part.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+    # One pass, because a title may look like a placeholder.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
 
 
 def page_contents(flight: Flight) -> dict[str, Any]:
-    """The JSON inside the page of `flight`: title, packed arrays, marks, and the plant that is drawn."""
+    """The JSON of `flight` in the page: title, packed arrays, marks, and the geometry of the plant."""
     shown = {name: flight[name] for name in SHOWN if name in flight.arrays}
-    if flight["contact_force"].any():  # whatever is carried pushes: zeros stand for what nobody measured
+    if flight["contact_force"].any():  # a carried object always exerts force, so zeros mean not measured
         shown |= {name: flight[name] for name in UNMEASURED}
     return {
         "title": flight.title,
@@ -63,7 +63,7 @@ def page_contents(flight: Flight) -> dict[str, Any]:
 
 
 def plant_of(plant: Plant) -> dict[str, Any]:
-    """The numbers of `plant` that the scene draws."""
+    """Geometry and gravity of `plant` for the scene."""
     followers = iter(range(1, plant.count))
     names = ["leader" if number == plant.leader else f"follower {next(followers)}" for number in range(plant.count)]
     return {
@@ -85,17 +85,17 @@ def plant_of(plant: Plant) -> dict[str, Any]:
 
 
 def _rotor_places(plant: Plant) -> list[list[list[float]]]:
-    """Of every drone, (x, y) of its rotors from its centre, body axes [m]."""
-    found = []
+    """(x, y) of the rotors of each drone from its centre, in the assembly's body axes [m]."""
+    places = []
     for drone, arm in zip(plant.drones, plant.of_drones("arm"), strict=True):
         c, s = math.cos(drone.yaw), math.sin(drone.yaw)
-        own = rotors.lever(arm, plant.layout) * np.array(rotors.PLACES[plant.layout], dtype=float)
-        found.append((own @ [[c, s], [-s, c]]).tolist())
-    return found
+        in_drone_axes = rotors.lever(arm, plant.layout) * np.array(rotors.PLACES[plant.layout], dtype=float)
+        places.append((in_drone_axes @ [[c, s], [-s, c]]).tolist())
+    return places
 
 
 def packed(array: np.ndarray) -> str:
-    """Row after row as little-endian float32 in base64."""
+    """`array` in row-major order as little-endian float32 in base64."""
     return base64.b64encode(np.ascontiguousarray(array, "<f4").tobytes()).decode("ascii")
 
 

@@ -1,1 +1,1 @@
-"""A policy file as something that flies without Python: an ONNX graph, a C99 header."""
+"""Exports of a policy file for use without Python: an ONNX graph and a C99 header."""

@@ -1,4 +1,4 @@
-"""A policy as one C99 header without allocation, for an app on board. Needs NumPy alone."""
+"""Export of a policy as one C99 header without allocation, for an app on board. Needs NumPy only."""
 
 from __future__ import annotations
 
@@ -15,13 +15,7 @@ from mjxball import __version__
 from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
 from mjxball.control.followers import LARGEST
 from mjxball.control.geometry import GEOMETRY_SIZE
-from mjxball.control.observation import (
-    ACTION_SIZE,
-    ERROR,
-    ERROR_RATE,
-    OBSERVATION,
-    OBSERVATION_SIZE,
-)
+from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
@@ -29,13 +23,13 @@ from mjxball.policy.inference import known_geometry
 from mjxball.policy.quantize import Rows, balanced, rows_of
 
 FLOAT = 4  # bytes
-WIDEST_INT8 = 512  # products of 8 and 16 bits whose sum fits into 32
-APP = "mjxball"  # what the names in an app on board begin with, of which there is one a program
+WIDEST_INT8 = 512  # largest number of 8-bit by 16-bit products whose sum fits into 32 bits
+APP = "mjxball"  # prefix of names in an app on board, of which a program has one
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """What a header costs on board [bytes]; code comes on top, about 1 KiB with -Os."""
+    """Memory of a header on board [bytes], without code, which takes about 1 KiB with -Os."""
 
     flash: int  # constants
     state: int  # `mjxball_follower`, where a pointer has 4 bytes
@@ -43,14 +37,14 @@ class Footprint:
 
 
 def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
-    """Bytes that the header of `policy` needs, see `c_header`."""
+    """Memory that the header of `policy` needs on board, see `c_header`."""
     (weights, biases), law = layers_of(policy), law_of(policy.card)
     size, units = len(policy.observation_mean), law.units
     outputs = [weight.shape[1] for weight in weights]
     widest = max(outputs[2 if units else 0 :])
     constants = 2 * ACTION_SIZE + GEOMETRY_SIZE * law.geometry
-    own = 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and behind both of `hidden`
-    state, stack = FLOAT * law.size + 4, FLOAT * (size + 2 * widest + own)
+    recurrent = 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and the ends of both `hidden`
+    state, stack = FLOAT * law.size + 4, FLOAT * (size + 2 * widest + recurrent)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
         return Footprint(flash, state + FLOAT, stack + 2 * (_most_inputs(weights) + 7))
@@ -66,11 +60,12 @@ def _most_inputs(weights: Sequence[np.ndarray]) -> int:
 def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | None = None) -> str:
     """The header's text. Its function `follow` computes what `mjxball.Policy` computes, in float.
 
-    All names begin with `prefix`, `prefix_of(name)` by default, so that headers of several policies fit into one
-    program; of two with the same names a compiler says so, since a header's guard is that of its contents. With `int8`
-    the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the same layout
-    may be put in place at run time, `follower.weights`. A policy that is told its team is that of the one follower that
-    `team` in its card names; InputError without it, and for layers too wide for `int8`.
+    All names begin with `prefix`, by default `prefix_of(name)`, so that headers of several policies fit into one
+    program. If two have the same prefix, the compiler reports it, because the include guard is a hash of the contents.
+
+    With `int8` the weights are 8-bit integers (`policy.quantize`) in one struct, which can be exchanged at run time for
+    another one of the same layout (`follower.weights`). A policy that takes its team's geometry is exported for the
+    follower in its metadata field `team`. InputError without that field, or for layers too wide for `int8`.
     """
     geometry = known_geometry(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
@@ -92,7 +87,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         trained=_plain(card["package_version"]),
         version=__version__,
         period=f"{card['control_period']:g}",
-        gravity=_number(card["gravity"]),
+        gravity=_literal(card["gravity"]),
         observation=_table(),
         layers=" x ".join(map(str, [size, *([f"GRU {law.units}"] if law.units else []), *outputs])),
         flash=cost.flash,
@@ -101,7 +96,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         size=size,
         widest=max(outputs) + law.units,
         most_inputs=most,
-        largest=_number(LARGEST),
+        largest=_literal(LARGEST),
         int8="#define MJXBALL_INT8 1\n" if int8 else "",
         weights=", weights of 8 bits" if int8 else "",
         includes="#include <stdint.h>\n\n" if int8 else "",
@@ -113,7 +108,9 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         memory_field=f"    mjxball_real memory[{law.size}];\n" if law.size else "",
         helpers=helpers,
         team="" if geometry is None else _team(card["team"]),
-        mount_angle="" if geometry is None else f"#define MJXBALL_MOUNT_ANGLE {_number(card['team']['mount_angle'])}\n",
+        mount_angle=""
+        if geometry is None
+        else f"#define MJXBALL_MOUNT_ANGLE {_literal(card['team']['mount_angle'])}\n",
         memory_pointer="    mjxball_real *memory = follower->memory;\n" if law.size else "",
         arrays="\n".join(arrays),
         history=_history(law),
@@ -125,19 +122,19 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
 
 
 def prefix_of(name: str) -> str:
-    """What the names in the header of a policy called `name` begin with; macros in upper case."""
+    """Prefix of all names in the header of the policy `name`; macros have it in upper case."""
     return f"{APP}_{re.sub('[^a-z0-9]', '_', name.lower())}"
 
 
 def _named(text: str, prefix: str) -> str:
-    """`text` with its own names; `MJXBALL_REAL` is its user's."""
+    """`text` with the names' prefix and the include guard replaced, but not `MJXBALL_REAL`, which the user sets."""
     text = text.replace("MJXBALL_GUARD", f"MJXBALL_H_{zlib.crc32(text.encode()):08X}")
     text = re.sub(r"\bmjxball_", f"{prefix}_", text)
     return re.sub(r"\bMJXBALL_(?!REAL\b)", f"{prefix.upper()}_", text)
 
 
 def _team(team: dict[str, Any]) -> str:
-    """Lines of the comment on the frame of a follower of a team."""
+    """Lines of the header's comment on the frame of a team's follower."""
     return (
         f" * It is drone {int(team['drone'])} of its team. Observation and command are in its mount frame: world and\n"
         " * body axes turned by MJXBALL_MOUNT_ANGLE [rad] about body z, so that its mount lies at negative x.\n"
@@ -145,9 +142,9 @@ def _team(team: dict[str, Any]) -> str:
 
 
 def layers_of(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Weights and biases without the last layer's second half, which exploration alone uses.
+    """(weights, biases) of all layers, without the outputs of the last one that only exploration uses.
 
-    Before them those of a GRU: for what is seen, and for its state, whose bias is empty.
+    A GRU comes first, as two layers: of its inputs, and of its state, with an empty bias.
     """
     weights = [*policy.weights[:-1], policy.weights[-1][:, :ACTION_SIZE]]
     biases = [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
@@ -166,26 +163,26 @@ def _float_arrays(policy: PolicyFile) -> list[str]:
 
 
 def _side_by_side(weight: np.ndarray) -> np.ndarray:
-    """`weight` (inputs, outputs) as (blocks, inputs, 4), outputs filled up with zeros: four of them in a block."""
+    """`weight` (inputs, outputs) as (blocks, inputs, 4): blocks of four outputs, padded with zero outputs."""
     inputs, outputs = weight.shape
     padded = np.pad(weight, ((0, 0), (0, rows_up(outputs) - outputs)))
     return padded.reshape(inputs, -1, 4).swapaxes(0, 1)
 
 
-def _number(value: float | np.floating) -> str:
-    """The shortest literal that is exactly this float."""
+def _literal(value: float | np.floating) -> str:
+    """The shortest C literal that is exactly this float."""
     return np.format_float_scientific(np.float32(value), unique=True, trim="0") + "f"
 
 
 def _array(label: str, values: Iterable[Any]) -> str:
-    numbers = [_number(value) for value in np.asarray(values, np.float32).ravel()]
-    rows = [", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8)]
+    literals = [_literal(value) for value in np.asarray(values, np.float32).ravel()]
+    rows = [", ".join(literals[k : k + 8]) for k in range(0, len(literals), 8)]
     body = ",\n    ".join(rows)
-    return f"static const float mjxball_{label}[{len(numbers)}] = {{\n    {body}}};"
+    return f"static const float mjxball_{label}[{len(literals)}] = {{\n    {body}}};"
 
 
 def _plain(text: Any) -> str:
-    """`text` fit for a C comment, whatever a policy's card says."""
+    """`text` with everything replaced that could end a C comment: it comes from a policy file."""
     return re.sub(r"[^A-Za-z0-9 ,.;:_+()-]", "?", str(text))[:200]
 
 
@@ -194,7 +191,7 @@ def _table() -> str:
 
 
 def _history(law: FollowerLaw) -> str:
-    """Lines that make the network's input of observation and memory (see `control.follower_law.FollowerLaw`)."""
+    """C lines that compute the network's input from observation and memory (`control.follower_law.FollowerLaw`)."""
     history = law.history
     if not law.size:
         return "    (void)follower;"
@@ -204,37 +201,37 @@ def _history(law: FollowerLaw) -> str:
     for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {k * width}, observation, {OBSERVATION_SIZE});"]
     if law.geometry:
-        kept = f"memory[{history.size + law.units} + i]"
-        lines += [f"        for (i = 0; i < {GEOMETRY_SIZE}; i++) {kept} = mjxball_geometry[i];"]
+        stored = f"memory[{history.size + law.units} + i]"
+        lines += [f"        for (i = 0; i < {GEOMETRY_SIZE}; i++) {stored} = mjxball_geometry[i];"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
-        place = OBSERVATION_SIZE + k * width
-        lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
+        offset = OBSERVATION_SIZE + k * width
+        lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{offset} + i] -= observation[i];"]
     if law.units:
         lines += _saturated(law, OBSERVATION_SIZE + history.size)
     return "\n".join(lines)
 
 
-def _saturated(law: FollowerLaw, place: int) -> list[str]:
-    """Lines that put what a recurrent network sees besides behind the first `place` numbers of `input`."""
+def _saturated(law: FollowerLaw, offset: int) -> list[str]:
+    """C lines that compute the additional inputs of a recurrent network, from index `offset` of `input` on."""
     lines = []
     for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE)):
-        small = f"observation[{part.start} + i] * (mjxball_real){1 / scale!r}"
-        lines += [f"    for (i = 0; i < 3; i++) input[{place} + i] = mjxball_tanh({small});"]
-        place += 3
+        scaled = f"observation[{part.start} + i] * (mjxball_real){1 / scale!r}"
+        lines += [f"    for (i = 0; i < 3; i++) input[{offset} + i] = mjxball_tanh({scaled});"]
+        offset += 3
     if law.geometry:
-        lines += [f"    mjxball_copy(input + {place}, memory + {law.history.size + law.units}, {GEOMETRY_SIZE});"]
+        lines += [f"    mjxball_copy(input + {offset}, memory + {law.history.size + law.units}, {GEOMETRY_SIZE});"]
     return lines
 
 
 def _history_update(law: FollowerLaw) -> str:
-    """Lines that move the memory on by one step."""
+    """C lines that advance the memory by one step."""
     lines, history, width = [], law.history, OBSERVATION_SIZE + ACTION_SIZE
     for k, tau in enumerate(history.filters):
-        place, share = k * width, _number(-math.expm1(-history.period / tau))
-        lines += [f"    mjxball_approach(memory + {place}, observation, {OBSERVATION_SIZE}, {share});"]
-        lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
+        offset, share = k * width, _literal(-math.expm1(-history.period / tau))
+        lines += [f"    mjxball_approach(memory + {offset}, observation, {OBSERVATION_SIZE}, {share});"]
+        lines += [f"    mjxball_approach(memory + {offset + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
     if law.units:
@@ -243,7 +240,7 @@ def _history_update(law: FollowerLaw) -> str:
 
 
 def _network(law: FollowerLaw, policy: PolicyFile, int8: bool) -> str:
-    """Lines that scale `input` and call the layers."""
+    """C lines that normalise `input` and call the layers."""
     size, own = len(policy.observation_mean), "w->" if int8 else "mjxball_"
     weights, biases = layers_of(policy)
     shapes = [weight.shape for weight in weights]
@@ -267,9 +264,9 @@ def _network(law: FollowerLaw, policy: PolicyFile, int8: bool) -> str:
 
 
 def _layers(shapes: Sequence[tuple[int, int]], calls: Sequence[str], source: str, units: int = 0) -> list[str]:
-    """`calls` of the layers, from `source` through two buffers in turn to `action`.
+    """C lines with the `calls` of the layers, from `source` through two alternating buffers to `action`.
 
-    The last one also sees the `units` numbers of `next`.
+    The last layer also takes the `units` entries of `next`, a GRU's state.
     """
     lines, last = [], len(shapes) - 1
     for number, (call, (inputs, outputs)) in enumerate(zip(calls, shapes, strict=True)):
@@ -284,27 +281,28 @@ def _layers(shapes: Sequence[tuple[int, int]], calls: Sequence[str], source: str
 
 
 def _called(layer: str) -> str:
+    """C line that calls `layer` and returns from `follow` if it fails."""
     return f"    if (!{layer}) return mjxball_no_answer(follower, action, command);"
 
 
 def stride(inputs: int) -> int:
-    """Weights of 8 bits in a row, a multiple of 8."""
+    """Length of a padded row of 8-bit weights: `inputs` rounded up to a multiple of 8."""
     return -(-inputs // 8) * 8
 
 
 def rows_up(outputs: int) -> int:
-    """Rows of weights, a multiple of 4."""
+    """Number of padded rows of weights: `outputs` rounded up to a multiple of 4."""
     return -(-outputs // 4) * 4
 
 
 def _weights_type(policy: PolicyFile) -> str:
-    """The struct whose bytes are `weight_bytes`."""
-    floats, whole = [f"{kind}[{len(policy.observation_mean)}]" for kind in ("mean", "scale")], []
+    """C definition of the struct `mjxball_weights`, whose bytes are `weight_bytes`."""
+    floats, integers = [f"{kind}[{len(policy.observation_mean)}]" for kind in ("mean", "scale")], []
     for n, (weight, bias) in enumerate(zip(*layers_of(policy), strict=True)):
         inputs, outputs = weight.shape
         floats += [f"step_{n}[{outputs}]", *([f"bias_{n}[{outputs}]"] if bias.size else [])]
-        whole += [f"weight_{n}[{rows_up(outputs) * stride(inputs)}]"]
-    fields = [*(f"float {one}" for one in floats), *(f"int8_t {one}" for one in whole)]
+        integers += [f"weight_{n}[{rows_up(outputs) * stride(inputs)}]"]
+    fields = [*(f"float {one}" for one in floats), *(f"int8_t {one}" for one in integers)]
     return "typedef struct {\n" + "".join(f"    {one};\n" for one in fields) + "} mjxball_weights;\n\n"
 
 
@@ -314,37 +312,37 @@ def _layers_int8(policy: PolicyFile) -> tuple[list[Rows], list[np.ndarray]]:
 
 
 def weight_bytes(policy: PolicyFile) -> bytes:
-    """The struct `mjxball_weights` of `policy` as a little-endian machine holds it."""
+    """The struct `mjxball_weights` of `policy` as bytes of a little-endian machine."""
     policy = balanced(policy)
-    rows, biases = _layers_int8(policy)
+    layers, biases = _layers_int8(policy)
     parts = [policy.observation_mean, policy.observation_scale]
-    for own, bias in zip(rows, biases, strict=True):
-        parts += [own.step, bias]
+    for layer, bias in zip(layers, biases, strict=True):
+        parts += [layer.step, bias]
     floats = b"".join(np.asarray(part, "<f4").tobytes() for part in parts)
-    return floats + b"".join(_padded(own.weight).tobytes() for own in rows)
+    return floats + b"".join(_padded(layer.weight).tobytes() for layer in layers)
 
 
 def float_bytes(policy: PolicyFile) -> bytes:
-    """What the network computes with, as a little-endian machine holds it."""
+    """Normalisation, weights and biases of the network as bytes of a little-endian machine."""
     weights, biases = layers_of(policy)
     parts = [*_scaling(policy), *(part for one in zip(weights, biases, strict=True) for part in one)]
     return b"".join(np.asarray(part, "<f4").tobytes() for part in parts)
 
 
 def _padded(weight: np.ndarray) -> np.ndarray:
-    """Rows of `weight` (outputs, inputs), both filled up with zeros."""
+    """`weight` (outputs, inputs) padded with zeros to whole rows and columns (`rows_up`, `stride`)."""
     outputs, inputs = weight.shape
     return np.pad(weight, ((0, rows_up(outputs) - outputs), (0, stride(inputs) - inputs)))
 
 
 def _compiled(policy: PolicyFile) -> str:
-    """The constant `mjxball_compiled`."""
+    """C definition of the constant `mjxball_compiled`, the 8-bit weights in the header."""
     policy = balanced(policy)
-    rows, biases = _layers_int8(policy)
-    parts: list[list[str]] = [[_number(value) for value in part] for part in _scaling(policy)]
-    for own, bias in zip(rows, biases, strict=True):
-        parts += [[_number(value) for value in part] for part in (own.step, bias) if part.size]
-    parts += [[str(value) for value in _padded(own.weight).ravel()] for own in rows]
+    layers, biases = _layers_int8(policy)
+    parts: list[list[str]] = [[_literal(value) for value in part] for part in _scaling(policy)]
+    for layer, bias in zip(layers, biases, strict=True):
+        parts += [[_literal(value) for value in part] for part in (layer.step, bias) if part.size]
+    parts += [[str(value) for value in _padded(layer.weight).ravel()] for layer in layers]
     return "static const mjxball_weights mjxball_compiled = {\n" + ",\n".join(map(_braced, parts)) + "};\n"
 
 
@@ -352,27 +350,27 @@ def _scaling(policy: PolicyFile) -> tuple[np.ndarray, np.ndarray]:
     return policy.observation_mean, policy.observation_scale
 
 
-def _braced(numbers: Sequence[str]) -> str:
-    return "    {" + ",\n     ".join(", ".join(numbers[k : k + 16]) for k in range(0, len(numbers), 16)) + "}"
+def _braced(literals: Sequence[str]) -> str:
+    return "    {" + ",\n     ".join(", ".join(literals[k : k + 16]) for k in range(0, len(literals), 16)) + "}"
 
 
 def _leader(card: dict[str, Any], to: str) -> list[str]:
-    """Lines that make the leader's PD law on the observed error, within the limits, in the array `to`."""
-    g = _number(card["gravity"])
-    wanted = [
-        f"{_number(kp)} * observation[{ERROR.start + k}] + {_number(kd)} * observation[{ERROR_RATE.start + k}]"
+    """C lines that compute the leader's PD command from the observed error, within the limits, into the array `to`."""
+    g = _literal(card["gravity"])
+    acceleration = [
+        f"{_literal(kp)} * observation[{ERROR.start + k}] + {_literal(kd)} * observation[{ERROR_RATE.start + k}]"
         for k, (kp, kd) in enumerate(zip(card["leader_kp"], card["leader_kd"], strict=True))
     ]
     return [
-        f"    {to}[0] = -({wanted[1]}) / {g};",
-        f"    {to}[1] = ({wanted[0]}) / {g};",
-        f"    {to}[2] = {wanted[2]};",
+        f"    {to}[0] = -({acceleration[1]}) / {g};",
+        f"    {to}[1] = ({acceleration[0]}) / {g};",
+        f"    {to}[2] = {acceleration[2]};",
         f"    for (i = 0; i < 3; i++) {to}[i] = mjxball_clip({to}[i], mjxball_limit[i]);",
     ]
 
 
 def _command(law: FollowerLaw) -> str:
-    """Lines that make the command of `action`, which is added to the PD law unless it is direct."""
+    """C lines that compute the command from `action`, which is added to the PD command unless the mode is direct."""
     base = "mjxball_copy_law(observation, command);"
     return "\n".join(
         [

@@ -1,4 +1,4 @@
-"""C texts of an exported follower, which `c_header` fills in."""
+"""Templates of the C code of an exported follower, which `c_header` fills in."""
 
 HEADER = """\
 /* Follower {name}, trained by mjxball {trained} ({origin}), exported by mjxball {version}.
@@ -10,12 +10,12 @@ HEADER = """\
  * observation (18), SI units and radians, world axes, body rates in body axes:
 {observation}
  * action (3): the network's mean in [-1, 1]. command (3): roll [rad], pitch [rad], vertical acceleration [m/s2].
- * status: 0, or else action and command are zeros, which is level. 1: a number of the observation is not finite, or
- * their absolute sum is not below MJXBALL_LARGEST; the memory stays as it was. 2: a number on the way to the result is
- * not finite; the next call starts a flight. Also with -ffast-math and the like: bits are looked at, not comparisons.
+ * status: 0, or else action and command are zeros, which is level flight. 1: the observation is not finite, or its
+ * absolute sum is not below MJXBALL_LARGEST; the memory is unchanged. 2: an intermediate result is not finite; the next
+ * call starts a flight. The checks hold with -ffast-math too, because they look at bits.
 {team} *
  * Network {layers}, ReLU, tanh{weights}. C99 without a library; no allocation, no globals but constants.
- * Bit for bit the same on every machine with IEEE floats if products and sums are not contracted (-ffp-contract=off).
+ * Results are bit-equal on all machines with IEEE floats if products and sums are not contracted (-ffp-contract=off).
  * Flash: {flash} bytes of constants, and the code. RAM: {state} bytes for mjxball_follower,
  * {stack} bytes of arrays on the stack during mjxball_follow.
  * Define MJXBALL_REAL as double before including this for arithmetic without rounding to float, at twice the RAM.
@@ -46,8 +46,8 @@ typedef MJXBALL_REAL mjxball_real;
 static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int count) {{
     for (int i = 0; i < count; i++) to[i] = from[i];
 }}
-/* The bits of the largest absolute value as float; bits are in the order of values, from 0x7F800000 on not finite. The
- * result is volatile, so that a compiler that is told of finite numbers only cannot know anything of it. */
+/* The bits of the largest absolute value as float. Bits have the order of the values; from 0x7F800000 on, these are not
+ * finite. The result is volatile, so that -ffinite-math-only cannot remove checks of it. */
 static inline unsigned mjxball_most(const mjxball_real *values, int count) {{
     volatile unsigned most;
     unsigned found = 0;
@@ -66,24 +66,24 @@ static inline unsigned mjxball_most(const mjxball_real *values, int count) {{
 static inline int mjxball_are_finite(const mjxball_real *values, int count) {{
     return mjxball_most(values, count) < 0x7F800000u;
 }}
-/* Whether the absolute sum is below `MJXBALL_LARGEST`: of numbers that are not finite it is not. */
+/* Whether all values are finite and their absolute sum is below `MJXBALL_LARGEST`. */
 static inline int mjxball_is_sound(const mjxball_real *values, int count) {{
     mjxball_real sum = 0;
     if (!mjxball_are_finite(values, count)) return 0;
     for (int i = 0; i < count; i++) sum += values[i] < 0 ? -values[i] : values[i];
     return sum < MJXBALL_LARGEST;
 }}
-/* What is not finite stays so. */
+/* A value that is not finite is returned unchanged. */
 static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
     if (!mjxball_are_finite(&value, 1)) return value;
     return value < -limit ? -limit : value > limit ? limit : value;
 }}
 {helpers}
-/* The leader's PD law on the observed error: what the `copy` follower commands. */
+/* The leader's PD controller on the observed error: the command of the `copy` follower. */
 static inline void mjxball_copy_law(const mjxball_real *observation, mjxball_real *to) {{
 {leader}
 }}
-/* Forget the past: the next call starts a flight. */
+/* Clear the memory: the next call starts a flight. */
 static inline void mjxball_reset(mjxball_follower *follower) {{
     follower->running = 0;
 }}
@@ -118,13 +118,13 @@ static inline void mjxball_approach(mjxball_real *average, const mjxball_real *v
 }
 """
 LAYER = """
-/* Products and sums as instructions of their own, where one for both takes longer (Cortex-M4). */
+/* Keep products and sums as separate instructions where a fused one takes longer (Cortex-M4). */
 #ifdef __ARM_FEATURE_DSP
 #define MJXBALL_APART(a, b, c, d) __asm__("" : "+w"(a), "+w"(b), "+w"(c), "+w"(d))
 #else
 #define MJXBALL_APART(a, b, c, d) (void)0
 #endif
-/* Four rows, whose weights stand side by side: what is loaded of the input serves them all. */
+/* Four rows at once, whose weights are interleaved, so that each input is loaded once for all four. */
 #define MJXBALL_ADD(weight, from, a, b, c, d) \\
     do { \\
         mjxball_real p = (weight)[0] * (from), q = (weight)[1] * (from); \\
@@ -136,8 +136,8 @@ LAYER = """
         d += s; \\
     } while (0)
 
-/* to = weight from + bias, where a bias of 0 is none. Rows are filled up to a multiple of four. Sums over even and odd
- * inputs round less than one long sum. False, and nothing is written, if `from` is not finite. */
+/* to = weight from + bias; a null bias is zero. Rows are padded to a multiple of four. Separate sums over even and odd
+ * inputs round less than one long sum. If `from` is not finite, nothing is written and 0 returned. */
 static inline int mjxball_layer(
     const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {
     if (!mjxball_are_finite(from, inputs)) return 0;
@@ -156,14 +156,14 @@ static inline int mjxball_layer(
 }
 """
 LAYER_INT8 = """
-/* The nearest whole number of a value within 16 bits. */
+/* The nearest integer of a value within 16 bits. */
 static inline int16_t mjxball_whole(mjxball_real value) {
     return (int16_t)((int)(value + (mjxball_real)32768.5) - 32768);
 }
 
-/* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range; zeros up to
- * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. 0, and nothing is written,
- * if one of the values is not finite. */
+/* Quantise values to 16 bits and return the step: the largest value takes the whole range; zeros follow up to `stride`.
+ * The middle two of every four values are swapped, as `mjxball_products` needs. If a value is not finite, nothing is
+ * written and 0 returned. */
 static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int stride, int16_t *to) {
     const union {
         unsigned bits;
@@ -183,7 +183,7 @@ static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, in
     return largest / 32767;
 }
 
-/* The sum and four products of a row: two multiplications an instruction where the processor has them. */
+/* `sum` plus four products of a row, with two multiplications per instruction where the processor has them. */
 #ifdef __ARM_FEATURE_DSP
 #include <arm_acle.h>
 static inline int32_t mjxball_products(const int8_t *weight, const int16_t *steps, int32_t sum) {
@@ -195,7 +195,7 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
     __asm__("sxtb16 %0, %1, ror #8" : "=r"(odd) : "r"(four));
     return __smlad(odd, inner, __smlad(__sxtb16((int8x4_t)four), outer, sum));
 }
-/* Loads that follow stay behind: registers are few. */
+/* Barrier: later loads must not move up, because registers are few. */
 #define MJXBALL_HERE __asm__ volatile("" ::: "memory")
 #else
 #define MJXBALL_HERE (void)0
@@ -205,9 +205,9 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
 }
 #endif
 
-/* to = step weight from + bias of whole numbers, where a bias of 0 is none: rows of `stride` weights, of which `inputs`
- * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four.
- * False, and nothing is written, if `from` is not finite. */
+/* to = step weight from + bias with integer weights; a null bias is zero. Rows have `stride` weights, of which `inputs`
+ * are used, and are padded to a multiple of four. Four rows at once share the loads of `from`. If `from` is not finite,
+ * nothing is written and 0 returned. */
 static inline int mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
     int16_t steps[MJXBALL_MOST_INPUTS + 7];
@@ -234,8 +234,8 @@ static inline int mjxball_layer(const int8_t *weight, const float *step, const f
 }
 """
 EXPONENTIAL = """
-/* exp(-x) for 0 <= x < 40, within 1e-15, is share (even - odd) / (even + odd): as many halvings as ln 2 goes into x,
- * and a Pade fraction of the rest. */
+/* exp(-x) for 0 <= x < 40, within 1e-15, as share (even - odd) / (even + odd): share is the nearest power of 1/2, the
+ * fraction a Pade approximant of the rest. */
 typedef struct {
     mjxball_real share, even, odd;
 } mjxball_fraction;
@@ -262,7 +262,8 @@ static inline mjxball_real mjxball_tanh(mjxball_real x) {
 }
 """
 GRU = """
-/* The next state of a gated recurrent unit: reset gates, update gates and candidates, given and of what it kept. */
+/* The next state of a gated recurrent unit. `given` and `kept`: contributions of inputs and of the state to the reset
+ * gates, update gates and candidates. */
 static inline void mjxball_gru(
     const mjxball_real *given, const mjxball_real *kept, const mjxball_real *state, int units, mjxball_real *next) {
     const mjxball_real half = (mjxball_real)0.5;

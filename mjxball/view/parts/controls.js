@@ -1,4 +1,4 @@
-// Keys and gestures, the theme, and a browser that cannot draw.
+// Keys, gestures and the theme, and the message of a browser that cannot draw.
 const KEYS = {
   ' ': ['Space', 'play or pause', (player) => player.toggle()],
   ArrowLeft: ['←', '0.1 s back; with Shift 1 s', (player, shift) => step(player, shift ? -10 : -1)],
@@ -11,7 +11,7 @@ const KEYS = {
   '?': ['?', 'show or hide this list', () => turnHelp()],
 };
 
-// By tenths of a second from where the clock is; sums of 0.1 would drift.
+// Move the clock by tenths of a second; adding 0.1 repeatedly would drift.
 const step = (player, tenths) => player.seek(Math.round((player.now + tenths / 10) * 1e6) / 1e6);
 
 const darkness = matchMedia('(prefers-color-scheme: dark)');
@@ -31,7 +31,7 @@ function turnHelp() {
   if (keys.open) keys.close(); else keys.showModal();
 }
 
-// Keys belong to the player, unless somebody writes text or has gone to a control by Tab.
+// Keys control the player, unless a text field has the focus or a control was reached by Tab.
 let tabbed = false;
 document.addEventListener('pointerdown', () => { tabbed = false; }, true);
 
@@ -43,7 +43,7 @@ function keyed(event, player) {
   const operated = tabbed && control && (event.key === ' ' || (control.matches('select') && event.key !== '?'));
   if (writes || operated || (document.getElementById('keys').open && event.key !== '?')) return;
   event.preventDefault();
-  if (!tabbed) control?.blur();  // else some browsers press the clicked button as Space is let go
+  if (!tabbed) control?.blur();  // some browsers press a focused button when Space is released
   KEYS[event.key][2](player, event.shiftKey);
 }
 

@@ -1,4 +1,4 @@
-// One flight: arrays of `rows` rows, flat, and what is computed from them.
+// One flight: flat arrays of `rows` rows, and values derived from them.
 class Flight {
   constructor({ title, rows, arrays, plant, marks = [] }) {
     Object.assign(this, { title, rows, plant, marks, arrays: {}, kept: [0], seen: 1, step: 0.005 });
@@ -12,7 +12,7 @@ class Flight {
     return new Float32Array(bytes.buffer);
   }
 
-  // Rows that came later, packed alike.
+  // Append rows, packed like the first ones.
   grow({ rows, arrays, marks }) {
     for (const [name, text] of Object.entries(arrays)) {
       const before = this.arrays[name], added = Flight.unpacked(text);
@@ -30,7 +30,7 @@ class Flight {
 
   get last() { return this.time[this.rows - 1]; }
 
-  // A flight that was really flown knows no CG, object mass or contact force.
+  // Logs of real flights have no CG, object mass or contact force.
   has(name) { return name in this.arrays; }
 
   width(name) { return this.arrays[name].length / this.rows; }
@@ -41,7 +41,7 @@ class Flight {
     return Array.from(this.arrays[name].subarray(row * width, (row + 1) * width));
   }
 
-  // Number `k` of that row.
+  // Element `k` of that row.
   get(name, row, k) { return this.arrays[name][row * this.width(name) + k]; }
 
   error(row, k) { return this.arrays.target[3 * row + k] - this.arrays.position[3 * row + k]; }
@@ -67,7 +67,7 @@ class Flight {
     return drone === leader ? 0 : drone + (drone < leader);
   }
 
-  // Name of the colour of drone number `drone`, in the scene and in the plots, and its dash there, the leader's too.
+  // Name of the colour of drone number `drone` in the scene and in the plots.
   colour(drone) { return `drone-${this.place(drone) % 6}`; }
 
   dash(drone) { return this.place(drone) === 0 ? [5, 3] : this.place(drone) > 5 ? [2, 2] : []; }
@@ -83,14 +83,14 @@ class Flight {
     return { low, high };
   }
 
-  // Some of the places where the object is, or should be.
+  // Up to 200 positions of the object and as many targets.
   places() {
     const every = Math.ceil(this.rows / 200), found = [];
     for (let row = 0; row < this.rows; row += every) found.push(this.at('position', row), this.at('target', row));
     return found;
   }
 
-  // Rows that show the path: each some millimetres from the one before, more where there would be too many.
+  // Rows of the drawn path, at least `step` metres apart; beyond 2000 rows `step` doubles.
   trail() {
     const { position: p } = this.arrays;
     const far = (a, b) => Math.hypot(...[0, 1, 2].map((axis) => p[3 * a + axis] - p[3 * b + axis]));
@@ -115,6 +115,6 @@ class Flight {
     return low + 1 < this.rows && this.time[low + 1] - time < time - this.time[low] ? low + 1 : low;
   }
 
-  // The mark of `kind` that holds at `time`.
+  // The last mark of `kind` up to `time`.
   markAt(kind, time) { return this.marks.filter((mark) => mark.kind === kind && mark.time <= time + 1e-3).pop(); }
 }

@@ -1,10 +1,10 @@
-// The player: one clock and one camera for all flights, and what is seen of each: a scene, numbers, marks and plots.
+// The player: one clock and one camera for all flights; each flight has a scene, readouts, marks and plots.
 
-// The array that each part of a scene is drawn from.
+// The array that each part of a scene needs.
 const NEEDED = { thrust: 'thrust', contact: 'contact_force', weight: 'object_mass', path: 'position' };
 const DEGREES = 180 / Math.PI;
 
-// What is plotted of the arrays that a flight has.
+// Plots of a flight, for the arrays that it has.
 function recipes(flight) {
   const line = (name, its, value, dash) => ({ name, colour: its, value, dash });
   const { leader, axes: along } = flight.plant;
@@ -55,7 +55,7 @@ class Pane {
     document.getElementById('marks').append(this.marks);
   }
 
-  // The marks on the time axis, which goes from `from` to `to`.
+  // Place the marks on the time axis from `from` to `to` [s].
   mark(from, to, player) {
     const { marks } = this.flight, phases = marks.filter(({ kind }) => kind === 'phase');
     const share = (time) => 100 * clamp((time - from) / (to - from), 0, 1);
@@ -78,7 +78,7 @@ class Pane {
     this.plots.forEach((plot) => plot.draw(now));
   }
 
-  // The numbers of the moment.
+  // Update the readouts to the time `now`.
   read(now) {
     const { flight } = this, row = flight.rowAt(now), phase = flight.markAt('phase', now);
     const [roll, pitch] = flight.at('euler', row);
@@ -164,7 +164,7 @@ class Player {
 
   world() { return surroundings(this.panes.map(({ flight }) => flight), this.camera); }
 
-  // Put the camera where all of the flights are seen, but leave how somebody has turned and zoomed.
+  // Move the camera so that all flights are in view, and keep the user's rotation and zoom.
   fit() {
     const world = this.world(), { camera } = this, zoomed = camera.distance / camera.home.distance;
     camera.home.distance = world.distance;
@@ -174,7 +174,7 @@ class Player {
     this.panes.forEach((pane) => pane.mark(this.first, this.last, this));
   }
 
-  // The rig comes to the middle; once it is left, the picture stays.
+  // Centre the view on the rig, or stop following without a jump of the picture.
   follow(on) {
     const { camera, panes: [{ scene, flight }] } = this, row = flight.rowAt(this.now);
     const before = scene.target(row);

@@ -1,8 +1,8 @@
 // Time plots: lines over time with a cursor; click or drag to seek.
 const LEFT = 54, RIGHT = 8, TOP = 6, BOTTOM = 18;
-const LEAST = 1e-3;  // of a y-range, in the plot's unit: rounding errors must not look like motion
+const LEAST = 1e-3;  // smallest y-range in the plot's unit, so that rounding errors do not look like motion
 
-// About `count` round numbers between low and high, two at least, each with its text.
+// About `count` round numbers between low and high, at least two, each with its text.
 function ticks(low, high, count) {
   const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map((k) => k * power).find((k) => k >= raw * 0.999);
@@ -11,16 +11,16 @@ function ticks(low, high, count) {
   return found.length > 1 || count > 10 ? found.map((v) => [v, fixed(v, step)]) : ticks(low, high, 2 * count);
 }
 
-// `value` with the decimals that steps of `step` have.
+// `value` with as many decimals as `step`.
 function fixed(value, step) {
   const text = value.toFixed(clamp(Math.ceil(-Math.log10(step) - 1e-9), 0, 9));
   return (+text ? text : text.replace('-', '')).replace('-', '−');
 }
 
-// Three digits, of a positive number.
+// A positive number with three significant digits.
 const short = (value) => String(+value.toPrecision(3));
 
-// Names are text: nothing is written as HTML.
+// An element with text, which is never interpreted as HTML.
 function element(kind, text = '', className = '') {
   const made = document.createElement(kind);
   made.textContent = text;
@@ -35,8 +35,8 @@ function swatch(name) {
 }
 
 class Plot {
-  // series: [{ name, colour, value, dash }], where value(row) is a number. `peers` are the plots of the same kind, of
-  // several flights, which have one y-range: that of what is seen, unless it is pinned.
+  // series: [{ name, colour, value, dash }], where value(row) is a number. `peers`: plots of the same kind, one per
+  // flight, which share a y-range: that of the visible rows, unless it is pinned.
   constructor(parent, { title, unit, series }, flight, peers, player) {
     Object.assign(this, { series, flight, peers });
     const block = element('div', '', 'plot'), head = element('h3', `${title} `), legend = element('div', '', 'legend');
@@ -78,7 +78,7 @@ class Plot {
   span(from, to) {
     [this.from, this.to] = [from, to];
     const { time, rows } = this.flight;
-    // One row more on both sides, so that lines go on to the edges.
+    // One more row on each side, so that lines reach the edges.
     let first = this.flight.rowAt(from), last = this.flight.rowAt(to);
     if (time[first] < from && first < last) first += 1;
     if (time[last] > to && first < last) last -= 1;
@@ -86,7 +86,7 @@ class Plot {
     [this.least, this.most] = this.extent(first, last);
   }
 
-  // Lowest and highest value of some rows.
+  // Lowest and highest value from row `first` to row `last`.
   extent(first, last) {
     let low = Infinity, high = -Infinity;
     for (const { value } of this.series) {
@@ -99,7 +99,7 @@ class Plot {
     return [low, high];
   }
 
-  // Call once all peers have their span.
+  // Set the y-range; to be called after `span` of all peers.
   range() {
     if (this.pinned) return;
     const low = Math.min(...this.peers.map((plot) => plot.least));
@@ -109,7 +109,7 @@ class Plot {
     [this.low, this.high] = [low - margin, high + margin];
   }
 
-  // The line of `value`: of the rows that fall on one pixel the lowest and the highest.
+  // Draw the line of `value`; rows on the same pixel are reduced to their lowest and highest value.
   trace(c, value, x, y, ratio) {
     let place, low, high;
     const end = () => { c.lineTo(place, y(low)); if (high !== low) c.lineTo(place, y(high)); };
@@ -128,7 +128,7 @@ class Plot {
     c.stroke();
   }
 
-  // The lines are drawn once for each size of the canvas, span and range.
+  // A picture of the lines, redrawn only if the canvas size, span or range changes.
   still(width, height, ratio) {
     const picture = document.createElement('canvas');
     [picture.width, picture.height] = [Math.round(width * ratio), Math.round(height * ratio)];
@@ -188,7 +188,7 @@ class Plot {
     c.beginPath(); c.moveTo(x, TOP); c.lineTo(x, height - BOTTOM); c.stroke();
   }
 
-  // The numbers of the legend. Call once all is drawn: to write text between two drawings would lay the page out twice.
+  // Update the values in the legend. To be called after all drawing, because text changes cause a new layout.
   read(row) {
     const step = Math.max(1e-4, 10 ** (Math.floor(Math.log10(this.high - this.low)) - 3));
     this.series.forEach(({ value, units }, k) => {
@@ -197,7 +197,7 @@ class Plot {
   }
 }
 
-// Many values from -1 to 1 over time, one row of colour each: red is positive, blue negative.
+// Many values in [-1, 1] over time, each as a row of colour: red is positive, blue negative.
 class Strips extends Plot {
   extent() { return [0, this.series[0].units]; }
 

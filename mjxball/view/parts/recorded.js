@@ -1,3 +1,3 @@
-// Recorded flights are in the page.
-const told = JSON.parse(document.getElementById('flight').textContent);
-const player = canDraw() && new Player(told.map((one) => new Flight(one)));
+// Start of a page with recorded flights.
+const recorded = JSON.parse(document.getElementById('flight').textContent);
+const player = canDraw() && new Player(recorded.map((one) => new Flight(one)));

@@ -1,9 +1,10 @@
 // The scene: faces, lines and arrows, sorted by depth and drawn on a plain 2D canvas.
 const LIGHT = [0.36, -0.48, 0.8];
-const THRUST = 0.3, CONTACT = 0.4, GOAL = 0.1;  // arrows of the largest forces and the goal's ring [m], of a rig of
-const RIG = 0.36;  // this radius or more; smaller ones have smaller ones
+// Lengths of the arrows of the largest forces, and radius of the goal's ring [m]. They shrink with rigs whose radius is
+// below RIG [m].
+const THRUST = 0.3, CONTACT = 0.4, GOAL = 0.1, RIG = 0.36;
 
-// Colours have a name, and are what the style sheet says of it in the theme of the moment.
+// Value of a named colour of the style sheet in the current theme, cached.
 const palette = new Map();
 function colour(name) {
   if (!palette.has(name)) {
@@ -20,7 +21,7 @@ function shaded(name, light, alpha) {
   return `rgba(${mix.join(',')},${alpha})`;
 }
 
-// What several flights share, so that they are seen from one place and their arrows have one scale.
+// Common camera distance, floor and arrow scales of several flights.
 function surroundings(flights, camera) {
   const bounds = flights.map((flight) => flight.bounds());
   const low = [0, 1, 2].map((k) => Math.min(...bounds.map((one) => one.low[k])));
@@ -37,7 +38,7 @@ function surroundings(flights, camera) {
     extent: Math.max(high[0] - low[0], high[1] - low[1]) / 2 + 0.5,
     goal: size * GOAL,
     distance: camera.whole([...places, ...arrows], rig),
-    // [m/N]; of a flight that goes on, for the largest that there can be.
+    // [m/N]; in a live flight from the largest possible thrust.
     reach: {
       thrust: size * THRUST / Math.max(...flights.map((flight) => flight.plant.thrust || flight.largest('thrust'))),
       contact: touching.length ? size * CONTACT / Math.max(...touching.map((flight) => flight.largestContact())) : 0,
@@ -46,14 +47,14 @@ function surroundings(flights, camera) {
 }
 
 class Scene {
-  // `shown` says which parts are drawn; it and the camera belong to all scenes.
+  // `shown`: which parts are drawn. All scenes share it and the camera.
   constructor(canvas, flight, camera, shown) {
     Object.assign(this, { canvas, flight, camera, shown, context: canvas.getContext('2d') });
   }
 
   has(kind) { return this.shown[kind] && this.flight.has(NEEDED[kind]); }
 
-  // What the camera orbits.
+  // The point that the camera orbits.
   target(row) { return this.camera.follow ? this.flight.at('position', row) : this.world.middle; }
 
   draw(row) {
@@ -73,7 +74,7 @@ class Scene {
     this.parts = [];
     this.ground();
     this.paint();
-    // Whatever the load's depth: neither the goal nor the path hides it.
+    // Painted before the team, so that goal and path never hide it.
     this.goal(row);
     if (this.has('path')) this.path(row);
     this.paint();
@@ -145,7 +146,7 @@ class Scene {
     });
   }
 
-  // A thin ring that faces the eye, with four strokes outwards and nothing in its middle, and its foot on the floor.
+  // A thin ring that faces the camera, with four outward strokes, and a dashed line down to the floor.
   goal(row) {
     const goal = this.flight.at('target', row), { right, up } = this.lens, radius = this.world.goal;
     const around = (share, angle) => add(goal, times(share * radius,
@@ -200,14 +201,14 @@ class Scene {
 
   disc(world, centre, radius, name, alpha) { this.face(this.circle(world, centre, radius), name, alpha); }
 
-  // Where the object's CG is, in body axes.
+  // Offset of the object's CG in body axes [m].
   offset(row) {
     const offset = [0, 0, 0], found = this.flight.at('cg_offset', row);
     this.flight.plant.axes.forEach((axis, k) => { offset[axis] = found[k]; });
     return offset;
   }
 
-  // Drawn last: it is inside the object.
+  // Painted last, because it is inside the object.
   centreOfGravity(row) {
     const { flight } = this, turned = rotate(flight.at('quaternion', row), this.offset(row));
     this.ball(add(flight.at('position', row), turned), flight.plant.ball, 'cg');
@@ -265,12 +266,12 @@ class Scene {
     c.fill();
   }
 
-  // For each scale of arrows one arrow of a round force, as long as it would be across the view at the load.
+  // Scale bars: for each kind of arrow a round force, with its length on screen at the load's depth.
   bars(row) {
     const depth = this.lens.project(this.flight.at('position', row))[2], { reach } = this.world;
     if (depth < 0.05) return [];
     const bar = (name, metres, text) => {
-      // Round where all scenes look, so that all show the same force.
+      // Rounded at the common camera distance, so that all scenes show the same force.
       const most = 80 * this.camera.distance / this.lens.focal / metres, power = 10 ** Math.floor(Math.log10(most));
       const value = [5, 2, 1].map((k) => k * power).find((k) => k <= most);
       return { name, value, pixels: value * metres * this.lens.focal / depth, text: `${short(value)} ${text}` };

@@ -13,13 +13,13 @@ function rotate([w, x, y, z], v) {
   return add(add(v, times(w, t)), cross(axis, t));
 }
 
-// Unit vectors of a view: towards the eye, to the right, up.
+// Unit vectors of a view: towards the camera, to the right, up.
 function axes({ azimuth, elevation }) {
   const ce = Math.cos(elevation), se = Math.sin(elevation), ca = Math.cos(azimuth), sa = Math.sin(azimuth);
   return { back: [ce * ca, ce * sa, se], right: [-sa, ca, 0], up: [-se * ca, -se * sa, ce] };
 }
 
-// How one looks, at whichever scene: it orbits a target, which is moved by `pan`.
+// Camera of all scenes: it orbits a target that is moved by `pan`.
 class Camera {
   constructor() {
     this.home = { azimuth: -1.15, elevation: 0.24, distance: 1, pan: [0, 0, 0] };
@@ -34,10 +34,10 @@ class Camera {
     this.elevation = clamp(this.elevation + 0.008 * dy, -0.3, 1.5);
   }
 
-  // By pixels over the focal length: what is at the target's depth goes along with the pointer.
+  // Pan by pixels over the focal length: points at the target's depth follow the pointer.
   slide(dx, dy) { this.pan = add(this.pan, this.across(-dx, -dy, this.distance)); }
 
-  // What is seen at (dx, dy) from the centre and at the target's depth stays there.
+  // Zoom so that the point at (dx, dy) from the centre, at the target's depth, stays in place.
   zoom(factor, dx = 0, dy = 0) {
     const before = this.distance;
     this.distance = clamp(before * factor, 0.3, 40);
@@ -49,8 +49,8 @@ class Camera {
     return add(times(dx * depth, right), times(-dy * depth, up));
   }
 
-  // Distance from which all `points`, given from the target, and what lies flat within `around` of each are seen at
-  // home.
+  // Distance at which the home view contains all `points`, relative to the target, and a horizontal disc of radius
+  // `around` about each.
   whole(points, around) {
     const { back, right, up } = axes(this.home);
     return Math.max(...points.map((p) => dot(p, back)
@@ -58,7 +58,7 @@ class Camera {
   }
 }
 
-// What a camera that looks at `target` sees in a picture of `width` x `height` pixels.
+// Projection of a camera that looks at `target` onto a picture of `width` x `height` pixels.
 class Lens {
   constructor(camera, target, width, height) {
     Object.assign(this, axes(camera));
@@ -67,7 +67,7 @@ class Lens {
     this.centre = [width / 2, height / 2];
   }
 
-  // [x, y] in pixels and the depth in metres; depth below 0.05 means behind the camera.
+  // [x, y] [pixels] and depth [m] of a point; a depth below 0.05 means behind the camera.
   project(point) {
     const from = sub(point, this.place), depth = -dot(from, this.back);
     const size = this.focal / Math.max(depth, 0.05);
