@@ -117,7 +117,7 @@ def test_rig_laws_fly_together_as_each_alone() -> None:
         np.testing.assert_array_equal(together.step(together.start(observation), observation, known)[1], alone)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_padded_rig_flies_as_it_does_alone() -> None:
     rigs = draw_rigs(UNIVERSAL, 3, 2, 7).rigs
     alone = dataclasses.replace(
