@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import with_settings
 from gymnasium.utils.seeding import np_random
+from tables import weekly
 
 from mjxball.config import Config, preset, with_plant
 from mjxball.gym import core
@@ -48,7 +49,7 @@ def start(seed: int) -> Any:
     return jax.random.split(jax.random.key(core.seed_number(np_random(seed)[0])))[1]
 
 
-@pytest.mark.parametrize("name", ["team", "transport"])
+@pytest.mark.parametrize("name", ["team", *weekly("transport")])
 def test_it_is_what_jaxmarl_asks_for(name: str):
     env, key = FollowersMultiAgentEnv(name), jax.random.PRNGKey(0)
     assert isinstance(env, MultiAgentEnv)
@@ -70,7 +71,7 @@ def test_it_is_what_jaxmarl_asks_for(name: str):
         assert dones[agent].dtype == bool
 
 
-@pytest.mark.parametrize("wrap", [False, True])
+@pytest.mark.parametrize("wrap", [True, *weekly(False)])
 def test_it_flies_as_pettingzoos_and_the_brax_environment(team: Config, env: FollowersMultiAgentEnv, wrap: bool):
     """Bit for bit, with and without JaxMARL's own reset at an end, until that end."""
     parallel, program = FollowersParallelEnv(config=team), core.program(team, "newton-euler")
