@@ -184,7 +184,7 @@ def transport() -> Config:
     return configs.preset("transport")
 
 
-@pytest.fixture(scope="session", params=["mjx", "newton-euler"])
+@pytest.fixture(scope="session", params=[pytest.param("mjx", marks=pytest.mark.slow), "newton-euler"])
 def engine(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -36,7 +36,7 @@ SHORTER = {
 
 
 # What takes half a minute, and other tests run as well: before a release.
-LONG = ("--algorithm gradient", "--plant team3", "--distributed", "eval.py bench", "--rehearse")
+LONG = ("--algorithm gradient", "--plant team3", "--distributed", "eval.py bench", "eval.py figures", "--rehearse")
 
 
 def test_the_block_of_the_leaderboard_is_what_its_script_writes() -> None:

@@ -147,6 +147,7 @@ def test_an_impulse_response_costs_its_logarithm(swept: bool, transport: Config)
     np.testing.assert_allclose((found - slope)[0], weight * np.array(wanted), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(transport: Config) -> None:
     """Two members side by side; the program has both windows and computes one."""
     gain, steps = np.array([[2.0, 1.5]]), 25

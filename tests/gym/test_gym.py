@@ -117,6 +117,7 @@ def test_seeds():
     assert not np.array_equal(FollowerEnv().reset()[0], FollowerEnv().reset()[0])
 
 
+@pytest.mark.slow
 def test_worlds_are_the_same_where_jax_counts_in_64_bits(short: Config):
     """JAX draws other numbers then, and what was seen was no member of the space."""
     actions = np.full((2, 3), 0.3, np.float32)
