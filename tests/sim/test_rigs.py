@@ -209,7 +209,7 @@ class TestUniversal:
         assert not found.failed.any()
         assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_effort_is_what_followers_command_apart_and_what_rotors_give(self) -> None:
         rigs, period = held_out(UNIVERSAL, 3).rows(slice(0, 8)), UNIVERSAL.timing.control_period
 
