@@ -188,7 +188,7 @@ from mjxball.baselines import make_baseline
 from mjxball.xla import enable_compilation_cache
 enable_compilation_cache()
 plant = config.preset("transport")
-simulate(plant, make_baseline("copy", plant), Scenario(seconds=0.1))
+simulate(plant, make_baseline("copy", plant), Scenario(seconds=0.1), "newton-euler")
 """
 
 
