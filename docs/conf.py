@@ -21,6 +21,7 @@ extensions = [
     "settings_table",
     "notebooks",
     "generated",
+    "values",
 ]
 exclude_patterns = ["_site", "_static"]
 html_theme = "furo"

@@ -81,9 +81,10 @@ TESTS = Path(__file__).parent
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
     *("fly/test_link", "fly/test_mocap_flight", "fly/test_main", "fly/test_watchdog", "fly/test_rehearsal"),
-    *("rig/test_rehearsal", "train/test_population", "train/test_distributed", "commands/test_evaluate"),
-    *("test_docs", "test_team_env", "commands/test_train", "sim/test_rigs", "algorithms/test_algorithms"),
-    *("train/test_extensions", "evaluate/test_figures", "evaluate/test_stability", "fly/test_defects"),
+    *("fly/rig/test_rehearsal", "train/test_population", "train/test_distributed", "commands/test_evaluate"),
+    *("train/test_cluster", "train/test_two_devices", "fly/app/test_flights", "fly/test_faults", "fly/test_measured"),
+    *("test_docs", "test_team_env", "commands/test_train", "baselines/test_mpc", "algorithms/test_algorithms"),
+    *("train/test_extensions", "commands/test_figures", "baselines/test_baselines", "fly/test_defects"),
     *("train/test_resume", "physics/test_engines", "train/test_program", "gym/test_gym"),
 )
 
@@ -184,7 +185,7 @@ def transport() -> Config:
     return configs.preset("transport")
 
 
-@pytest.fixture(scope="session", params=["mjx", "newton-euler"])
+@pytest.fixture(scope="session", params=[pytest.param("mjx", marks=pytest.mark.slow), "newton-euler"])
 def engine(request: pytest.FixtureRequest) -> str:
     return request.param
 

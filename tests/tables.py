@@ -1,17 +1,13 @@
-"""Support: one test that loops over the rows of a table, and numbers that a page says."""
+"""Support: one test that loops over the rows of a table, and cases that run weekly."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
-from command_line import REPOSITORY
-
-NUMBER = r"(-?\d+(?: \d{3})*(?:\.\d+)?)"
 
 
 def rows(names: str | tuple[str, ...], table: Iterable[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -45,17 +41,3 @@ def rows(names: str | tuple[str, ...], table: Iterable[Any]) -> Callable[[Callab
 def weekly(*cases: Any) -> list[Any]:
     """Cases of `parametrize` that repeat others: every week and before a release."""
     return [pytest.param(case, marks=pytest.mark.release) for case in cases]
-
-
-def says(page: str, phrase: str, numbers: Sequence[float]) -> None:
-    """The `page` has this `phrase`, `numbers` in place of every #, rounded to its digits, and any text for ' … '."""
-    text = " ".join((REPOSITORY / page).read_text(encoding="utf-8").replace("**", "").split())
-    found = re.search(re.escape(phrase).replace(r"\#", NUMBER).replace(r"\ …\ ", ".*?"), text)
-    assert found, phrase
-    assert len(found.groups()) == len(numbers), numbers
-    assert all(map(is_rounded, found.groups(), numbers)), (found.groups(), numbers)
-
-
-def is_rounded(text: str, number: float) -> bool:
-    """Whether `text` is the `number`, rounded to its digits."""
-    return abs(float(text.replace(" ", "")) - number) <= 0.5001 * 10.0 ** -len(text.partition(".")[2])

@@ -47,7 +47,7 @@ def base_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-@pytest.mark.slow
+@pytest.mark.release  # with the packages of this environment, test_readme.py
 def test_policy_needs_numpy_alone(base_python: Path, tmp_path: Path) -> None:
     draw = np.random.default_rng(0)
     observations = draw.normal(scale=0.5, size=(20, 18))

@@ -261,6 +261,7 @@ def test_the_notebook_is_stored_without_outputs() -> None:
     )
 
 
+@pytest.mark.release
 def test_the_notebook_runs() -> None:
     import nbformat
     from nbclient import NotebookClient

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import tokenize
 from collections.abc import Iterator
@@ -37,6 +38,7 @@ def qualified(tree: ast.AST, prefix: tuple[str, ...]) -> Iterator[tuple[str, ...
             yield from qualified(node, prefix)
 
 
+@functools.cache
 def everything() -> set[tuple[str, ...]]:
     """All qualified names of the package, and all their endings."""
     found: set[tuple[str, ...]] = set()
@@ -71,7 +73,6 @@ def is_file(name: str) -> bool:
     return ("/" not in name and FILE.search(name) is not None) or any((place / name).exists() for place in places)
 
 
-KNOWN = everything()
 FIELD = re.compile(r"^    (\w+):", re.MULTILINE)
 SETTINGS = {name for path in (PACKAGE / "config").glob("*.py") for name in FIELD.findall(path.read_text())}
 
@@ -84,7 +85,7 @@ def stale(path: Path) -> list[str]:
             parts = tuple(name.split("."))
             if not ("." in name or "/" in name) or is_file(name) or parts[0] in FOREIGN | VARIABLES | local:
                 continue
-            if parts not in KNOWN and parts[1:] != () and not (parts[-1] in SETTINGS and len(parts) <= 3):
+            if parts not in everything() and parts[1:] != () and not (parts[-1] in SETTINGS and len(parts) <= 3):
                 found.append(f"{path.relative_to(REPOSITORY)}:{line}: {name}")
     return found
 

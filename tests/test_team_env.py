@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from plants import team
+from tables import weekly
 
 from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
@@ -306,7 +307,7 @@ def test_the_table_of_rigs_has_one_row_for_each_size() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["sac", "ppo", pytest.param("gradient", marks=pytest.mark.release)])
+@pytest.mark.parametrize("algorithm", ["sac", *weekly("ppo", "gradient")])
 def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
     """A few steps of each: 6 followers in four worlds, half of them padded; finite numbers, weights that move."""
     sizes = {"num_envs": 6, "policy_layers": (8,)}
@@ -331,7 +332,7 @@ def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
     assert statistics.peaks["error"].shape == (6,)
 
 
-@pytest.mark.slow
+@pytest.mark.release  # of plants, tests/physics
 def test_padded_worlds_move_alike_on_mjx_and_in_closed_form() -> None:
     """One world of each size, rigs of their own, 20 control steps in float32."""
     plants, keys = [], jax.random.split(jax.random.key(0), len(SIZES))

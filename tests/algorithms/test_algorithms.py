@@ -16,6 +16,7 @@ import scipy.linalg
 import toys
 from command_line import TRANSPORT, assert_refused
 from conftest import with_settings
+from tables import weekly
 
 from mjxball.algorithms.base import Phase, Shards
 from mjxball.algorithms.gradient import FirstOrderGradient, starts_anew
@@ -146,6 +147,7 @@ def test_an_impulse_response_costs_its_logarithm(swept: bool, transport: Config)
     np.testing.assert_allclose((found - slope)[0], weight * np.array(wanted), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(transport: Config) -> None:
     """Two members side by side; the program has both windows and computes one."""
     gain, steps = np.array([[2.0, 1.5]]), 25
@@ -260,7 +262,7 @@ def test_a_point_is_pushed_to_rest(name: str, transport: Config) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ppo", "gradient", "sac"])
+@pytest.mark.parametrize("name", ["ppo", "gradient", *weekly("sac")])
 def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     config = with_settings(transport, timing={"episode_steps": 80}, **{name: SMALL[name]})
     extensions = Extensions(toys.DoubleIntegrator, None, find(name, "--algorithm"))
@@ -285,7 +287,7 @@ def layers_of(contents: PolicyFile, seen: np.ndarray) -> list[np.ndarray]:
 NARROW = ["--gradient.policy_layers", "8"]
 
 
-@pytest.mark.slow
+@pytest.mark.release  # of a recurrent one, test_recurrent.py
 def test_a_run_by_gradient_writes_a_policy_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None, capsys: pytest.CaptureFixture
 ) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import toys
 from conftest import Recurrent, with_settings
-from tables import rows
+from tables import rows, weekly
 
 from algorithms.test_algorithms import TRAIN, A, B, LinearQuadratic, Q, R, gradient_of
 from mjxball.algorithms import ppo, sac
@@ -179,7 +179,7 @@ def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LEARNING)
+@pytest.mark.parametrize("name", ["gradient", *weekly("sac", "ppo")])
 def test_what_was_seen_once_is_remembered(name: str, transport: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who answers 0 after the first step pays 0.8 ** 2 / 3 in nine of ten steps, 0.19 a step."""
     monkeypatch.setattr(ppo, "REWARD_SCALE", 1.0)  # rewards of at most 1

@@ -18,7 +18,7 @@ from mjxball.evaluate.metrics import measure
 from mjxball.evaluate.results import Result, fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE, cross
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rollout import simulate
+from mjxball.sim.rollout import simulate, simulate_batch
 from mjxball.sim.scenario import Scenario
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
@@ -65,10 +65,9 @@ def test_mass_adaptation_finds_an_unknown_mass() -> None:
     """Kept at 0.2 kg of belief the pair sags by dm g / (2 m kp); with adaptation the height comes back."""
     config = preset("paper")
     scenario = Scenario(mass=0.3, believed_mass=0.2, seconds=40.0)
-    sags = {}
-    for name in ("adaptive", "adaptive-mass"):
-        flight = simulate(config, make_baseline(name, config), scenario, "newton-euler")
-        sags[name] = float(flight.error[-1, 2])
+    names = ("adaptive", "adaptive-mass")
+    flown = simulate_batch(config, [(make_baseline(name, config), [scenario]) for name in names], "newton-euler")
+    sags = dict(zip(names, flown.error[-1, :, 2], strict=True))
     expected = 0.1 * 9.81 / (2 * 1.1 * 0.5)
     assert sags["adaptive"] == pytest.approx(expected, rel=0.05)
     assert abs(sags["adaptive-mass"]) < 0.02
@@ -176,10 +175,9 @@ def test_observer_integrals_and_mpc_take_off_a_torque_and_a_mass_that_nobody_tol
     """A load at rest at 3 cm, 0.3 kg believed 0.2 kg: the PD law alone stays away."""
     config, offset_free = preset("paper"), ("observer", "pid", "mpc")
     scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=0.03, mass=0.3, believed_mass=0.2, seconds=45.0)
-    left = {
-        name: np.abs(simulate(config, make_baseline(name, config), scenario, "newton-euler").error[-1]).max()
-        for name in ("copy", *offset_free)
-    }
+    names = ("copy", *offset_free)
+    flown = simulate_batch(config, [(make_baseline(name, config), [scenario]) for name in names], "newton-euler")
+    left = dict(zip(names, np.abs(flown.error[-1]).max(axis=-1), strict=True))
     assert left["copy"] > 0.1
     assert max(left[name] for name in offset_free) < 2e-4, left
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from plants import team
-from tables import rows
+from tables import rows, weekly
 
 from batch import fly_compiled
 from mjxball.baselines import make_baseline, make_law
@@ -39,9 +39,7 @@ def flown(config: Config, names: list[str], scenarios: list[Scenario]) -> dict[s
     return {name: found[number * count : (number + 1) * count] for number, name in enumerate(names)}
 
 
-@pytest.mark.parametrize(
-    "name", ["team6", *(pytest.param(name, marks=pytest.mark.slow) for name in ("team3", "team4"))]
-)
+@pytest.mark.parametrize("name", [pytest.param("team6", marks=pytest.mark.slow), *weekly("team3", "team4")])
 def test_what_is_left_of_a_load_that_moves_in_the_plane(name: str) -> None:
     config = TEAMS[name]
     scenarios = [
@@ -187,7 +185,7 @@ def test_with_a_known_failure_the_plan_is_at_once_for_those_that_are_left() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["adaptive-mass", "lqg-known-failures", "oracle"])
+@pytest.mark.parametrize("name", ["lqg-known-failures", *weekly("adaptive-mass", "oracle")])
 def test_a_batch_of_a_team_equals_its_recorded_flights(name: str) -> None:
     """On JAX in float32, a loss among them: 1e-3 m, or half a per cent of a fall."""
     common = {"mass": 0.6, "path": ELLIPSE, "seconds": 21.0}

@@ -31,21 +31,22 @@ def cells_of(path: Path) -> list[dict[str, Any]]:
     return contents["cells"]
 
 
-@pytest.fixture(scope="module")
-def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """(cells, printed) of `eval.py --check` with neither policies nor scenarios, as a process, in another directory."""
-    place = tmp_path_factory.mktemp("standard")
-    done = run([script("eval.py"), *FAST, "--check", "--json", "cells.json"], place)
+def standard(place: Path, *policies: object) -> tuple[list[dict[str, Any]], str]:
+    """(cells, printed) of `eval.py --check` with these policies, as a process, in another directory."""
+    done = run([script("eval.py"), *policies, *FAST, "--check", "--json", "cells.json"], place)
     assert done.returncode == 0
     assert done.stderr == ""
     assert set(listing(place)) == {"cells.json"}
-    return place / "cells.json", done.stdout
+    return cells_of(place / "cells.json"), done.stdout
 
 
 @pytest.fixture(scope="module")
-def standard(checked: tuple[Path, str]) -> list[dict[str, Any]]:
-    """Cells of every shipped policy for the paper's plant and of every baseline on the standard scenarios."""
-    return [cell for cell in cells_of(checked[0]) if cell["mass"] == 0.2]
+def copied(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """Cells of `copy`, at every speed, with and without motion of the CG."""
+    path = tmp_path_factory.mktemp("copied") / "cells.json"
+    scenarios = ["--omega", *SPEEDS, "--amplitude", 0, 0.05]
+    assert call(main, [*FAST, "--followers", "copy", *scenarios, "--json", path]) == 0
+    return cells_of(path)
 
 
 # --- numbers --------------------------------------------------------------------------------------------------------
@@ -58,21 +59,8 @@ def one(cells: list[dict[str, Any]], **wanted: Any) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_no_arguments_judge_every_shipped_policy_and_baseline(standard: list[dict[str, Any]]) -> None:
-    here, others = group_by_plant(shipped_policies())
-    names = {*BASELINES, *(path.stem for path in here)}
-    assert {"balance", "paper"} <= names
-    assert {"flight", "stand", "universal"} <= {config.preset for config, _ in others}
-    scenarios = {(0.31, 0.0), *((omega, 0.05) for omega in SPEEDS)}
-    assert {(cell["follower"], cell["omega"], cell["amplitude"]) for cell in standard} == {
-        (name, *scenario) for name in names for scenario in scenarios
-    }
-    assert len(standard) == len(names) * len(scenarios)
-
-
-@pytest.mark.slow
-def test_cells_have_the_fixed_keys_and_types(standard: list[dict[str, Any]]) -> None:
-    for cell in standard:
+def test_cells_have_the_fixed_keys_and_types(copied: list[dict[str, Any]]) -> None:
+    for cell in copied:
         assert set(cell) == {"follower", *SCENARIO_KEYS, *NUMBERS, "failed"}
         assert isinstance(cell["follower"], str)
         assert isinstance(cell["failed"], bool)
@@ -84,24 +72,24 @@ def test_cells_have_the_fixed_keys_and_types(standard: list[dict[str, Any]]) -> 
 # From an independent simulation that runs its attitude loop at 500 Hz; 5 % covers the difference.
 @pytest.mark.slow
 @pytest.mark.parametrize(("omega", "x_peak"), zip(SPEEDS, (0.296, 0.258, 0.163, 0.050, 0.023), strict=True))
-def test_copy_sways_as_the_reference_says(standard: list[dict[str, Any]], omega: float, x_peak: float) -> None:
-    cell = one(standard, follower="copy", omega=omega, amplitude=0.05)
+def test_copy_sways_as_the_reference_says(copied: list[dict[str, Any]], omega: float, x_peak: float) -> None:
+    cell = one(copied, omega=omega, amplitude=0.05)
     assert cell["x_peak"] == pytest.approx(x_peak, rel=0.05)
     assert cell["y_peak"] < 1e-3  # nothing pushes sideways
     assert not cell["failed"]
 
 
 @pytest.mark.slow
-def test_copy_reaches_the_reference_rmse_and_never_settles(standard: list[dict[str, Any]]) -> None:
-    cell = one(standard, follower="copy", omega=0.31, amplitude=0.05)
+def test_copy_reaches_the_reference_rmse_and_never_settles(copied: list[dict[str, Any]]) -> None:
+    cell = one(copied, omega=0.31, amplitude=0.05)
     assert cell["rmse"] == pytest.approx(0.520, rel=0.05)
     assert cell["settling_time"] is None
     assert cell["action_error"] < 1e-9  # copying is its definition
 
 
 @pytest.mark.slow
-def test_copy_without_cg_motion_settles_as_the_reference_says(standard: list[dict[str, Any]]) -> None:
-    cell = one(standard, follower="copy", amplitude=0.0)
+def test_copy_without_cg_motion_settles_as_the_reference_says(copied: list[dict[str, Any]]) -> None:
+    cell = one(copied, omega=0.31, amplitude=0.0)
     assert cell["settling_time"] == pytest.approx(7.96, rel=0.05)
     assert cell["rmse"] == pytest.approx(0.479, rel=0.05)
     assert cell["x_peak"] < 1e-3
@@ -210,11 +198,28 @@ def test_suites_refuse_a_policy_for_crazyflies(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.slow
-def test_every_shipped_policy_meets_its_card_from_anywhere(checked: tuple[Path, str]) -> None:
-    shipped = {path.stem for path in shipped_policies()}
-    assert {"paper", "balance", "flight", "stand"} <= shipped
-    for name in shipped:
-        assert f"check {name}: ok" in checked[1]
+def test_policies_of_two_plants_meet_their_cards_from_anywhere(tmp_path: Path) -> None:
+    _, printed = standard(tmp_path, "balance", "flight")
+    assert "check balance: ok" in printed
+    assert "check flight: ok" in printed
+
+
+@pytest.mark.release
+def test_no_arguments_judge_every_shipped_policy_and_baseline(tmp_path: Path) -> None:
+    shipped = shipped_policies()
+    here, others = group_by_plant(shipped)
+    names = {*BASELINES, *(path.stem for path in here)}
+    assert {"balance", "paper"} <= names
+    assert {"flight", "stand", "universal"} <= {config.preset for config, _ in others}
+    scenarios = {(0.31, 0.0), *((omega, 0.05) for omega in SPEEDS)}
+    found, printed = standard(tmp_path)
+    cells = [cell for cell in found if cell["mass"] == 0.2]
+    assert {(cell["follower"], cell["omega"], cell["amplitude"]) for cell in cells} == {
+        (name, *scenario) for name in names for scenario in scenarios
+    }
+    assert len(cells) == len(names) * len(scenarios)
+    for path in shipped:
+        assert f"check {path.stem}: ok" in printed
 
 
 @pytest.mark.slow

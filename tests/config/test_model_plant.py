@@ -9,7 +9,7 @@ import models
 import numpy as np
 import pytest
 from models import DRONE, INERTIAL, mjcf, motors, rotors, written
-from tables import rows
+from tables import rows, weekly
 
 from mjxball.cli import plant_setup
 from mjxball.config import Plant, read_plant, thrust_over_weight
@@ -132,7 +132,7 @@ def test_yaw_gears_that_cannot_turn_the_drone_alone_are_taken_to_alternate(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["drone", "mirrored", "urdf", "rig"])
+@pytest.mark.parametrize("name", ["rig", *weekly("drone", "mirrored", "urdf")])
 def test_the_policy_for_any_rig_flies_them(name: str, tmp_path: Path) -> None:
     """To within 2 % of the way in less than 4 s, and the load's sway stays below 1 cm."""
     mirrored = mjcf(f"<body><freejoint/>{INERTIAL}{rotors(places=models.SQUARE)}</body>", motors())

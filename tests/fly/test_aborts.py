@@ -110,12 +110,15 @@ SAFE_WITHIN = 9.0  # [s] battery_time 5, then LAND; all others are far below
 
 
 FIRST = (lost, jump, crash, interrupt, kill)  # one of each way to end
-# Every fault at one drone, alternately, and at the other weekly.
+LIKE = (slow, clock, reboot, stuck)  # end as others do
+# Every other fault at one drone, alternately; at both weekly.
 AT = [
     pytest.param(fault, number, marks=marks, id=f"{fault.__name__}-{number}")
     for index, fault in enumerate(FAULTS)
     for number in (0, 1)
-    for marks in [pytest.mark.release if index % 2 != number else () if fault in FIRST else pytest.mark.slow]
+    for marks in [
+        pytest.mark.release if index % 2 != number or fault in LIKE else () if fault in FIRST else pytest.mark.slow
+    ]
 ]
 
 
@@ -158,7 +161,7 @@ def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
     assert 2 * np.abs(tilt).max() < math.radians(20)
 
 
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, *weekly(1)])
 def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0, times=QUICK))
     world.fly_until(State.FLY)
@@ -192,7 +195,7 @@ def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -
     assert world.running() == [False, False]
 
 
-@pytest.mark.parametrize("seconds", [0.4, pytest.param(0.11, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seconds", [0.4, *weekly(0.11)])
 def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
     world = VirtualTwin(FlightSettings(seconds=6.0))
     world.fly_until(State.FLY)
@@ -208,9 +211,7 @@ def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
     assert world.flight.lifted
 
 
-@pytest.mark.parametrize(
-    "state", [State.FLY, *(pytest.param(state, marks=pytest.mark.slow) for state in (State.RAMP, State.LAND))]
-)
+@pytest.mark.parametrize("state", [State.FLY, *weekly(State.RAMP, State.LAND)])
 def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
     """States that come and go must not let hold and descent take turns for ever."""
     world = VirtualTwin(FlightSettings(seconds=1.0))

@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
+from tables import weekly
 
 from mjxball.control.rotations import roll_of_quaternion
 from mjxball.policy import Policy
@@ -64,9 +65,7 @@ def test_two_flights_in_a_row_need_no_reboot() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "curve", ["older", *(pytest.param(curve, marks=pytest.mark.slow) for curve in ("linear", "cubic"))]
-)
+@pytest.mark.parametrize("curve", ["older", *weekly("linear", "cubic")])
 def test_either_firmware_is_recognised_and_flown_alike(curve: str) -> None:
     """Defects 3, 4: a card for one force curve crashed on the other. 20 mm is what the issue asks of either."""
     world = world_of("flight", 6.0, curve, delay=0.005)
@@ -145,7 +144,14 @@ def test_the_stand_keeps_its_ball_under_the_estimators_sideways_motion() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "drones"), [("lost", (0,)), ("lost", (0, 1)), ("jump", (1,)), ("frozen", (0,))])
+@pytest.mark.parametrize(
+    ("kind", "drones"),
+    [
+        ("lost", (0, 1)),
+        ("jump", (1,)),
+        *(pytest.param(kind, (0,), marks=pytest.mark.release) for kind in ("lost", "frozen")),
+    ],
+)
 def test_an_estimator_that_loses_its_pose_brings_the_pair_down_gently(kind: str, drones: tuple[int, ...]) -> None:
     """Defect 6: lost poses were not noticed, frozen ones cut the motors at 0.2 m, a jump at 0.4 m (2.7 m/s)."""
     world = world_of("flight", 4.0)

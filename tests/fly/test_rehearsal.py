@@ -178,7 +178,10 @@ def flies(log: Path, process: subprocess.Popen[str]) -> bool:
             *("runner", signal.SIGSTOP, -signal.SIGKILL, f"{TOO_SLOW} in real time: .* --slow 2"),
             marks=pytest.mark.release,
         ),
-        ("twin", signal.SIGKILL, 2, "the twin has ended: it was killed, or it crashed"),
+        pytest.param(
+            *("twin", signal.SIGKILL, 2, "the twin has ended: it was killed, or it crashed"),
+            marks=pytest.mark.release,
+        ),
     ],
 )
 def test_a_process_that_stands_still_is_a_computer_that_is_too_slow(

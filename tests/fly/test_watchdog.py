@@ -196,7 +196,7 @@ def brought_down(flight: Flown | None) -> Flown:
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, *weekly(signal.SIGSTOP)], ids=["killed", "hung"])
 def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_path: Path) -> None:
     def lose(runner: subprocess.Popen, twin: Twin) -> None:
         while twin.truth.state.position[:, 2].min() < 0.25 and runner.poll() is None:
@@ -238,7 +238,7 @@ TAKEN_OVER = 0.4  # [s] after the last setpoint
 @pytest.mark.alone
 @pytest.mark.parametrize(
     "phase",
-    ["fly", "hold", *weekly("ramp", "land", "descend", "stop")],
+    ["fly", *weekly("ramp", "hold", "land", "descend", "stop")],
 )
 def test_a_main_thread_that_stands_still_at_a_change_of_phase_is_found(phase: str, tmp_path: Path) -> None:
     """Its other threads go on: states come, the display writes, pings go out."""

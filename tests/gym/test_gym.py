@@ -18,6 +18,7 @@ from command_line import run
 from conftest import compile_env, with_settings
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.seeding import np_random
+from tables import weekly
 
 import mjxball.gym
 from mjxball.baselines import make_baseline
@@ -60,7 +61,8 @@ def test_every_preset_of_a_pair_is_registered():
     "name",
     [
         "Transport",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("Paper", "Stand", "Flight")),
+        pytest.param("Flight", marks=pytest.mark.slow),
+        *weekly("Paper", "Stand"),
     ],
 )
 def test_gymnasiums_checker_finds_nothing(name: str):
@@ -115,6 +117,7 @@ def test_seeds():
     assert not np.array_equal(FollowerEnv().reset()[0], FollowerEnv().reset()[0])
 
 
+@pytest.mark.slow
 def test_worlds_are_the_same_where_jax_counts_in_64_bits(short: Config):
     """JAX draws other numbers then, and what was seen was no member of the space."""
     actions = np.full((2, 3), 0.3, np.float32)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +11,18 @@ import numpy as np
 import pytest
 from conftest import with_settings
 from gymnasium.utils.seeding import np_random
+from tables import weekly
 
 from mjxball.config import Config, preset, with_plant
 from mjxball.gym import core
 from mjxball.gym.parallel import FollowersParallelEnv
 
-pytest.importorskip("jaxmarl")
-from jaxmarl.environments.multi_agent_env import MultiAgentEnv, State
-from jaxmarl.environments.spaces import Space
-from jaxmarl.wrappers.baselines import LogWrapper
+if TYPE_CHECKING:
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
 
-from mjxball.gym.jaxmarl import FollowersMultiAgentEnv
+    from mjxball.gym.jaxmarl import FollowersMultiAgentEnv
 
-pytestmark = pytest.mark.slow  # to import JaxMARL takes 4 s
+pytestmark = pytest.mark.slow  # to import JaxMARL takes 4 s, so that nothing here does while tests are collected
 STEPS = 8  # of an episode
 
 
@@ -33,8 +33,17 @@ def team() -> Config:
 
 
 @pytest.fixture(scope="module")
-def env(team: Config) -> FollowersMultiAgentEnv:
-    return FollowersMultiAgentEnv(config=team)
+def make() -> Callable[..., FollowersMultiAgentEnv]:
+    """The class of the environments."""
+    pytest.importorskip("jaxmarl")
+    from mjxball.gym.jaxmarl import FollowersMultiAgentEnv
+
+    return FollowersMultiAgentEnv
+
+
+@pytest.fixture(scope="module")
+def env(make: Callable[..., FollowersMultiAgentEnv], team: Config) -> FollowersMultiAgentEnv:
+    return make(config=team)
 
 
 def draws(env: MultiAgentEnv, key: Any) -> dict[str, Any]:
@@ -48,9 +57,12 @@ def start(seed: int) -> Any:
     return jax.random.split(jax.random.key(core.seed_number(np_random(seed)[0])))[1]
 
 
-@pytest.mark.parametrize("name", ["team", "transport"])
-def test_it_is_what_jaxmarl_asks_for(name: str):
-    env, key = FollowersMultiAgentEnv(name), jax.random.PRNGKey(0)
+@pytest.mark.parametrize("name", ["team", *weekly("transport")])
+def test_it_is_what_jaxmarl_asks_for(name: str, make: Callable[..., FollowersMultiAgentEnv]):
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv, State
+    from jaxmarl.environments.spaces import Space
+
+    env, key = make(name), jax.random.PRNGKey(0)
     assert isinstance(env, MultiAgentEnv)
     assert env.num_agents == len(env.agents)
     assert env.agent_classes == {"follower": env.agents}
@@ -70,7 +82,7 @@ def test_it_is_what_jaxmarl_asks_for(name: str):
         assert dones[agent].dtype == bool
 
 
-@pytest.mark.parametrize("wrap", [False, True])
+@pytest.mark.parametrize("wrap", [True, *weekly(False)])
 def test_it_flies_as_pettingzoos_and_the_brax_environment(team: Config, env: FollowersMultiAgentEnv, wrap: bool):
     """Bit for bit, with and without JaxMARL's own reset at an end, until that end."""
     parallel, program = FollowersParallelEnv(config=team), core.program(team, "newton-euler")
@@ -100,6 +112,8 @@ def test_it_flies_as_pettingzoos_and_the_brax_environment(team: Config, env: Fol
 
 def test_a_rollout_inside_one_program(env: FollowersMultiAgentEnv):
     """Five worlds, three episodes each, counted by JaxMARL's wrapper; worlds and episodes differ."""
+    from jaxmarl.wrappers.baselines import LogWrapper
+
     logged = LogWrapper(env)
 
     def rollout(key: Any) -> tuple[Any, Any]:
@@ -135,9 +149,9 @@ def test_an_episode_may_begin_at_a_given_state(env: FollowersMultiAgentEnv):
     jax.tree.map(np.testing.assert_array_equal, (seen, state), (wanted, given))
 
 
-def test_teams_of_several_sizes():
+def test_teams_of_several_sizes(make: Callable[..., FollowersMultiAgentEnv]):
     """An agent that is not there is done and has zeros; the others have what PettingZoo's have."""
-    env, parallel, found = FollowersMultiAgentEnv("team"), FollowersParallelEnv("team"), set()
+    env, parallel, found = make("team"), FollowersParallelEnv("team"), set()
     step = jax.jit(env.step_env)
     for seed in range(40):
         shown, _ = parallel.reset(seed=seed)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_wrench
-from tables import rows
+from tables import rows, weekly
 
 from engines import random_states
 from mjxball.config import Attitude, Motion, replace
@@ -23,8 +23,8 @@ TOLERANCE = 1e-9  # float64 leaves about 1e-14
 FUNCTIONS = ("prescribed", "rolling")
 MOTIONS = [(Motion(), 0), (SAMPLES, 0), (ROLLING, 0), (Motion(), 2)]
 SECOND = mujoco.make_engine
-# MJX takes seconds to compile for a plant: one of them is flown by every other test that is quick.
-FIRST_OR_SLOW = [pytest.param(name, marks=() if name == "varied" else pytest.mark.slow) for name in PLANTS]
+# MJX takes seconds to compile for a plant.
+ONE_OR_ALL = ["varied", *weekly(*(name for name in PLANTS if name != "varied"))]
 
 
 def relative_difference(found: tuple, expected: tuple) -> float:
@@ -66,7 +66,7 @@ def test_engines_agree_on_every_plant(name: str, function: str) -> None:
     assert relative_difference(closed(*arguments), second(*arguments)) <= TOLERANCE
 
 
-@pytest.mark.parametrize("name", FIRST_OR_SLOW)
+@pytest.mark.parametrize("name", ONE_OR_ALL)
 def test_mjx_agrees_on_every_plant(name: str) -> None:
     plant = PLANTS[name]
     closed = newton_euler.make_engine(plant, Attitude())
@@ -106,7 +106,11 @@ def test_engines_agree_on_10_000_states_for_every_motion(motion: Motion, changes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("motion", "changes"), MOTIONS[1:], ids=lambda value: str(value)[:24])
+@pytest.mark.parametrize(
+    ("motion", "changes"),
+    [pytest.param(*row, marks=() if row[0] is ROLLING else pytest.mark.release) for row in MOTIONS[1:]],
+    ids=lambda value: str(value)[:24],
+)
 def test_mjx_agrees_on_10_000_states_for_every_motion(motion: Motion, changes: int) -> None:
     config, *arguments = violent(motion, changes)
     closed = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
@@ -137,7 +141,9 @@ def test_added_inertia_is_that_of_drones_which_have_it(name: str, function: str)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "function"), [("reference", "prescribed"), ("heave", "rolling")])
+@pytest.mark.parametrize(
+    ("name", "function"), [("heave", "rolling"), pytest.param("reference", "prescribed", marks=pytest.mark.release)]
+)
 def test_mjx_takes_added_inertia(name: str, function: str) -> None:
     plant, arguments, more, expected = with_more_inertia(name, function)
     fast = jitted(lambda: getattr(mjx.make_engine(plant, Attitude()), function))

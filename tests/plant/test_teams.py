@@ -60,10 +60,10 @@ def test_closed_form_and_mujoco_agree_on_every_team(count: int, load: str, stand
 
 
 MJX_TEAMS = [
-    pytest.param(3, "plane", "free"),
-    pytest.param(4, "light ball on a plate", "free", marks=pytest.mark.slow),
-    pytest.param(6, "light ball on a plate", "heave", marks=pytest.mark.slow),
-    pytest.param(2, "line", "pivot", marks=pytest.mark.slow),
+    pytest.param(3, "plane", "free", marks=pytest.mark.slow),
+    pytest.param(4, "light ball on a plate", "free", marks=pytest.mark.release),
+    pytest.param(6, "light ball on a plate", "heave", marks=pytest.mark.release),
+    pytest.param(2, "line", "pivot", marks=pytest.mark.release),
 ]
 
 

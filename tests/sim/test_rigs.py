@@ -117,7 +117,7 @@ def test_rig_laws_fly_together_as_each_alone() -> None:
         np.testing.assert_array_equal(together.step(together.start(observation), observation, known)[1], alone)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_padded_rig_flies_as_it_does_alone() -> None:
     rigs = draw_rigs(UNIVERSAL, 3, 2, 7).rigs
     alone = dataclasses.replace(
@@ -209,7 +209,7 @@ class TestUniversal:
         assert not any(one.failed for one in found)
         assert np.median([one.peak for one in found]) < 0.1
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_effort_is_what_followers_command_apart_and_what_rotors_give(self) -> None:
         rigs, period = held_out(UNIVERSAL, 3).rows(slice(0, 8)), UNIVERSAL.timing.control_period
 

@@ -13,6 +13,7 @@ import pytest
 import toys
 from command_line import REPOSITORY, environment
 from conftest import with_settings
+from tables import weekly
 
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.commands.train import main
@@ -99,7 +100,7 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sac", "ppo"])
+@pytest.mark.parametrize("name", ["sac", *weekly("ppo")])
 def test_an_episode_that_ends_early_has_its_own_return(name: str, small: Config) -> None:
     """An environment that earns 1 a step and ends after 7: not the 60 of an episode of the time limit."""
     program = Program(small, "newton-euler", extensions=Extensions(toys.Brief, None, find(name, "--algorithm")))

@@ -14,6 +14,7 @@ import pytest
 from command_line import REPOSITORY, assert_one_line, environment, listing, script, tiny
 from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, PartitionSpec
+from tables import weekly
 
 from mjxball import cli, entry
 from mjxball import config as configs
@@ -48,7 +49,7 @@ def trained(key: jax.Array) -> jax.Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("platform", ["cuda", "nonsense"])
+@pytest.mark.parametrize("platform", ["cuda", *weekly("nonsense")])
 def test_an_absent_device_is_bad_input(tmp_path: Path, platform: str) -> None:
     """Exit code 1 would say that training diverged, or that a policy misses its bounds."""
     for command in ("train.py", "eval.py"):
@@ -80,7 +81,7 @@ def test_an_error_of_the_program_is_no_result(monkeypatch: pytest.MonkeyPatch, c
         assert "not the user's fault" in capsys.readouterr().err  # with its traceback
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_64_bits_change_nothing_of_a_run(tmp_path: Path) -> None:
     """The same policy to the bit, so that a run may be resumed with or without."""
     found = []

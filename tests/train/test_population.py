@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+import toys
 from command_line import HASTY
 from conftest import with_settings
 
@@ -24,6 +25,7 @@ from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
 from mjxball.train.curves import best_member, read_members
+from mjxball.train.extensions import Extensions
 from mjxball.train.population import Population, partitioned_by_gspmd
 from mjxball.train.run_directory import read_sweep
 from mjxball.train.stretch import advance
@@ -41,6 +43,7 @@ SMALL = {
 }
 FLAGS = [word for name, value in SMALL.items() for word in (f"--sac.{name}", str(value).strip("(),"))]
 FLAGS += ["--physics", "newton-euler", "--timing.episode_steps", "60"]
+POINT = Extensions(toys.DoubleIntegrator)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +53,8 @@ def small(transport: Config) -> Config:
 
 @pytest.fixture(scope="module")
 def together(small: Config) -> tuple[Population, Any, Any]:
-    """Two members, and what they are after 5 and 20 steps of training."""
-    population = Population(small, "newton-euler", 2)
+    """Two members, and what they are after 5 and 20 steps of training, on what compiles soonest."""
+    population = Population(small, "newton-euler", 2, extensions=POINT)
     compiled = population.compile(creating=True)
     state, *_ = advance(population, compiled, population.start(compiled, 5), programs.warmup(10))
     state, *_ = advance(population, compiled, state, programs.train(5))
@@ -62,7 +65,7 @@ def together(small: Config) -> tuple[Population, Any, Any]:
 @pytest.mark.slow
 def test_members_are_the_runs_of_their_seeds(small: Config, together: tuple[Population, Any, Any]) -> None:
     population, _, late = together
-    single = Population(small, "newton-euler")
+    single = Population(small, "newton-euler", extensions=POINT)
     compiled = single.compile(creating=True)
     for member in range(2):
         state, *_ = advance(single, compiled, single.start(compiled, 5 + member), programs.warmup(10))
@@ -181,22 +184,26 @@ def test_population_run_exports_every_member_and_the_best(
 def test_members_are_spread_over_devices(together: tuple[Population, Any, Any], tmp_path: Path) -> None:
     """Two CPU devices in a process of their own: the same members as on one, up to rounding."""
     code = f"""
-import jax, numpy as np
+import sys, jax, numpy as np
+sys.path.append({str(REPOSITORY / "tests")!r})
+import toys
 from mjxball import config as C
+from mjxball.train.extensions import Extensions
 from mjxball.train.population import Population
 from mjxball.train import program as P
 from mjxball.train.stretch import advance
 config = C.preset("transport")
 for name, value in {SMALL!r}.items():
     config = C.replace(config, "sac." + name, value)
-population = Population(config, "newton-euler", 2)
+point = Extensions(toys.DoubleIntegrator)
+population = Population(config, "newton-euler", 2, extensions=point)
 assert population.devices == jax.local_device_count() == 2
 compiled = population.compile(creating=True)
 state, *_ = advance(population, compiled, population.start(compiled, 5), P.warmup(10))
 state, *_ = advance(population, compiled, state, P.train(5))
 leaves = jax.tree.leaves(state.algorithm.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
-assert Population(config, "newton-euler", 2, devices=jax.local_devices()[:1]).devices == 1
+assert Population(config, "newton-euler", 2, devices=jax.local_devices()[:1], extensions=point).devices == 1
 np.savez({str(tmp_path / "spread.npz")!r}, *map(np.asarray, leaves))
 """
     flags = f"{HASTY} --xla_force_host_platform_device_count=2"

@@ -38,7 +38,7 @@ class Rig:
         self.thrust, self.added, self.lag, self.late = thrust, added, lag, late
 
 
-RIGS = {"weak and slow": Rig(0.9, 4e-4, 1.4, 2)}  # stronger and quicker ones: tests/rig/test_rehearsal.py
+RIGS = {"weak and slow": Rig(0.9, 4e-4, 1.4, 2)}  # stronger and quicker ones: tests/fly/rig/test_rehearsal.py
 
 
 def record(config: Config, rig: Rig, seconds: float, noise: float = 1.0) -> dict[str, np.ndarray]:

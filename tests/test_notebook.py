@@ -156,7 +156,7 @@ def test_no_notebook_here(config: Config) -> None:
         train(config, jax.random.PRNGKey(0), on_progress=True)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_training_in_a_notebook_draws_itself(short: Config) -> None:
     import nbformat
     from nbclient import NotebookClient
@@ -188,7 +188,7 @@ from mjxball.baselines import make_baseline
 from mjxball.xla import enable_compilation_cache
 enable_compilation_cache()
 plant = config.preset("transport")
-simulate(plant, make_baseline("copy", plant), Scenario(seconds=0.1))
+simulate(plant, make_baseline("copy", plant), Scenario(seconds=0.1), "newton-euler")
 """
 
 

@@ -1,4 +1,4 @@
-"""Measured numbers of the pages are those of the files that they name."""
+"""Tables of measurements on the pages are those of the files that they name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from command_line import REPOSITORY
-from tables import is_rounded, rows, says
+from tables import rows
 
 Numbers = list[Any]  # in the order of a row; None: never
 
@@ -37,12 +37,8 @@ def levels() -> Iterator[tuple[str, Numbers]]:
     for row, name in (("[peak]", "peak"), ("RMSE", "rmse"), ("smallest settling", "settling_time")):
         yield row, [own["reached"][name], len(own["levels"])]
     yield "beyond trim", [number for pair in own["beyond trim"] for number in pair]
-    best = measured("balance")["levels"]
     for row, suite, level in (("peak at twice", "noise", "2"), ("peak in gusts", "gusts", "0.6 N")):
-        other, ours = (one(found, suite=suite, level=level) for found in (best, own["levels"]))
-        assert other["peak of"] in ("transport", "robust")
-        yield row, [1e3 * ours["peak"]]
-        says("docs/results.md", f"(`{other['peak of']}`: # mm)", [1e3 * other["peak"]])
+        yield row, [1e3 * one(own["levels"], suite=suite, level=level)["peak"]]
 
 
 def seeds() -> Iterator[tuple[str, Numbers]]:
@@ -153,8 +149,6 @@ def trainers() -> Iterator[tuple[str, Numbers]]:
 def crazyflies() -> Iterator[tuple[str, Numbers]]:
     for row in measured("crazyflie")["flight"]:
         yield row["follower"], [row["crashes"], row["rmse"], row["rmse, worst of 99 %"]]
-    kept = {row["follower"]: row["kept"] * row["starts"] for row in measured("crazyflie")["stand"]}
-    says("docs/results.md", "On 100 random stands `stand` keeps # balls, `lqg` #", [kept["stand"], kept["lqg"]])
 
 
 def onboard() -> Iterator[tuple[str, Numbers]]:
@@ -194,6 +188,11 @@ def test_a_table_is_that_of_its_file(section: str) -> None:
         assert any(agree(line, numbers) for line in found), (name, numbers, found)
 
 
+def is_rounded(text: str, number: float) -> bool:
+    """Whether `text` is the `number`, rounded to its digits."""
+    return abs(float(text.replace(" ", "")) - number) <= 0.5001 * 10.0 ** -len(text.partition(".")[2])
+
+
 def agree(line: str, numbers: Numbers) -> bool:
     """The row has these numbers, rounded to its digits, in this order; others may follow or stand before the first."""
     cells = re.sub(r"(?<=\d) (?=\d{3} )", "", line.partition(" | ")[2])
@@ -215,50 +214,3 @@ def test_what_was_flown_for_ten_minutes(policy: str) -> None:
     assert shown
     for number in filter(None, sum(shown, ())):
         assert any(agree(f" | {number}", [peak]) for peak in peaks), (number, peaks)
-
-
-def hovers(board: bool) -> list[float]:
-    rows = measured("onboard_flights")["delay"]
-    return [row["rmse"] for row in rows if row["policy"] == "flight" and (row["case"] != "laptop") is board]
-
-
-def rounding(pivot: bool) -> float:
-    own = [row for row in measured("engines")["rows"] if (row["stand"] == "pivot") is pivot]
-    return max(row[name] for row in own for name in row if "form" in name or "MJX" in name)
-
-
-def silent_uplink() -> Numbers:
-    own = [row for row in measured("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"]
-    return [max(row[name] for row in own) for name in ("height", "speed")]
-
-
-def drawn_apart() -> Numbers:
-    rows = [row for row in measured("horizon")["rows"] if row["seconds"] == 600]
-    return [
-        max(row[part + when] for row in rows if row["plant"] == name)
-        for when in ("", "_at_end")
-        for name in ("team3", "team4", "team6")
-        for part in ("command_spread", "rotor_power")
-    ]
-
-
-SAID: tuple[tuple[str, str, Callable[[], Numbers]], ...] = (
-    ("onboard", "within # mm rms on board", lambda: [max(hovers(True))]),
-    ("onboard", "within # to # mm", lambda: [min(hovers(False)), max(hovers(False))]),
-    ("onboard", "Under # faults", lambda: [len({row["fault"] for row in measured("onboard_flights")["faults"]})]),
-    (
-        "followers",
-        "tilts are # rad apart in `team3` (power # of hover's), # in `team4` (#), # in `team6` (#); in their last 20 s "
-        "# (#), # (#), # (#)",
-        drawn_apart,
-    ),
-    ("followers", "of `mpc` among some # sets", lambda: [measured("mpc_tuning")["sets"]]),
-    ("flying", "from # m they touch down at # m/s", silent_uplink),
-    ("model", "#e-13 relative; #e-12 on the pivot", lambda: [1e13 * rounding(False), 1e12 * rounding(True)]),
-    ("gym", "the same # random episodes", lambda: [measured("foreign_trainers")["episodes"]]),
-)
-
-
-@rows("page, phrase, wanted", SAID)
-def test_prose_says_what_was_measured(page: str, phrase: str, wanted: Callable[[], Numbers]) -> None:
-    says(f"docs/{page}.md", phrase, wanted())

@@ -1,0 +1,157 @@
+"""Values on the pages come from the code: `{{ takeoff.CLIMB }}` is replaced before a page is parsed.
+
+Between the braces stands a Python expression of the names below, and a format where the page rounds: `{{ TILT:.2f }}`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import math
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+REPOSITORY = Path(__file__).parents[2]
+sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "benchmarks")]
+
+from mjxball.cli import plant_setup  # noqa: E402
+from mjxball.config import Autopilot, apply_overrides, preset, total_mass  # noqa: E402
+from mjxball.control import crazyflie, motors  # noqa: E402
+from mjxball.control.axes import axes  # noqa: E402
+from mjxball.control.constants import hover  # noqa: E402
+from mjxball.control.margins import REQUIREMENTS  # noqa: E402
+from mjxball.plant import plant_parameters  # noqa: E402
+from mjxball.plant.trim import largest_amplitude  # noqa: E402
+from mjxball.policy import file  # noqa: E402
+from mjxball.policy.formats.c_header import weight_bytes  # noqa: E402
+from mjxball.sim import disturbances  # noqa: E402
+from mjxball.sim.rigs import HELD_OUT_RIGS  # noqa: E402
+from mjxfly.limits import Limits, Times  # noqa: E402
+from mjxfly.mocap_supervision import MocapLimits  # noqa: E402
+from mjxfly.preflight import Preflight  # noqa: E402
+from mjxfly.twin.conditions import Battery  # noqa: E402
+from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
+
+MODULES = (  # known by their last name
+    *("cells", "horizon", "rigs", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
+    *("mjxball.control.follower_law", "mjxball.control.motors", "mjxball.evaluate.metrics", "mjxball.physics.engine"),
+    *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),
+    *("mjxball.train.program", "mjxfly.app.protocol", "mjxfly.view.live"),
+    *(f"mjxfly.{name}" for name in ("card", "measured", "monitor", "positioning", "preflight", "probe", "setpoints")),
+    *(f"mjxfly.{name}" for name in ("takeoff", "uri", "watchdog")),
+)
+DEG = 180 / math.pi
+pair, older, upgrade, brushless = (
+    plant_setup(Path(f"crazyflie{name}")) for name in ("", "-older", "-thrust-upgrade", "-brushless")
+)
+rig, team, plate = pair.plant, plant_setup(Path("team3")).plant, plant_setup(Path("plate4")).plant
+ball = rig.object_mass * rig.moving_fraction  # [kg]
+paper, transport, flight, stand = (preset(name) for name in ("paper", "transport", "flight", "stand"))
+two = paper.plant
+stiffness = np.array(plant_parameters(two, paper.attitude).gains.kp)  # of the attitude loop [N m/rad]
+tilt = 0.2 * 9.81 * 0.05 / stiffness[1]  # of a command that holds 0.2 kg 5 cm off [rad]
+wide = apply_overrides(paper, {"plant.cg_axis": "xy", "plant.object_size": (0.34, 0.3, 0.05)})
+full = float(motors.force(motors.MOTORS["2.1"], np.array(crazyflie.FULL), 3.0 - WORN_SAG))
+c_files = "".join(path.read_text() for path in sorted((REPOSITORY / "mjxfly/app").glob("*.[ch]")))
+defined = re.findall(r"#define (\w+) ([\d.e-]+)[fu]?\b", c_files)
+
+
+def layers(name: str) -> SimpleNamespace:
+    """Recurrent units and units of the layer of a shipped policy."""
+    with np.load(file.shipped_policy(name)) as found:
+        return SimpleNamespace(recurrent=len(found["gru_recurrent"]), dense=len(found["bias_0"]))
+
+
+@functools.cache
+def results(name: str) -> Any:
+    """Contents of a file of `benchmarks/results/`."""
+    return json.loads((REPOSITORY / "benchmarks" / "results" / f"{name}.json").read_text())
+
+
+def largest(found: list[dict[str, Any]], key: str) -> float:
+    """The largest value of `key` in rows of such a file."""
+    return max(row[key] for row in found)
+
+
+def hovers(board: bool) -> list[float]:
+    """Errors of `flight` in hover [mm rms], of every radio delay, with its controller on board or on the laptop."""
+    found = results("onboard_flights")["delay"]
+    return [row["rmse"] for row in found if row["policy"] == "flight" and (row["case"] != "laptop") is board]
+
+
+def rounding(pivot: bool) -> float:
+    """Largest relative difference between the engines' accelerations, on the pivot or elsewhere."""
+    own = [row for row in results("engines")["rows"] if (row["stand"] == "pivot") is pivot]
+    return max(row[name] for row in own for name in row if "form" in name or "MJX" in name)
+
+
+def best(suite: str, level: str) -> dict[str, Any]:
+    """What the best follower other than `balance` reaches on a level of the benchmark."""
+    (row,) = (row for row in results("balance")["levels"] if (row["suite"], row["level"]) == (suite, level))
+    return row
+
+
+ten_minutes = {
+    name: SimpleNamespace(
+        **{
+            key: largest(
+                [row for row in results("horizon")["rows"] if (row["seconds"], row["plant"]) == (600, name)], key
+            )
+            for key in ("command_spread", "rotor_power", "command_spread_at_end", "rotor_power_at_end")
+        }
+    )
+    for name in ("team3", "team4", "team6")
+}
+
+NAMES: dict[str, Any] = {
+    **{name.rpartition(".")[2]: importlib.import_module(name) for name in MODULES},
+    **{name: value for name, value in globals().items() if not name.startswith("_")},
+    "C": SimpleNamespace(**{name: float(value) for name, value in defined}),  # of the apps on board
+    "axes": axes,
+    "hover": hover,
+    "HELD_OUT_RIGS": HELD_OUT_RIGS,
+    "autopilot": Autopilot(),
+    "limits": Limits(),
+    "times": Times(),
+    "mocap": MocapLimits(),
+    "ready": Preflight(),
+    "battery": Battery(),
+    "need": REQUIREMENTS,
+    "frequency": paper.attitude.natural_frequency,
+    "inertia": 2 * stiffness / np.array(paper.attitude.natural_frequency) ** 2,
+    "balance": layers("balance"),
+    "universal": layers("universal"),
+    "noise": disturbances.NOISE[[0, 3, 6, 9]],
+    "reach_of_rotors": largest_amplitude(wide.plant, 0.2, 0.0, (0.0, 1.0)),
+    "reach_of_commands": largest_amplitude(wide, 0.2, 0.0, (0.0, 1.0)),
+    "lift": 8 * full / 9.81 / total_mass(rig),  # share of the weight that a battery of 3 V carries
+    "ten_minutes": SimpleNamespace(**ten_minutes),
+    "silent": [row for row in results("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"],
+    "kept": {row["follower"]: row["kept"] * row["starts"] for row in results("crazyflie")["stand"]},
+    "upload": len(weight_bytes(file.load_file(file.shipped_policy("flight")))),
+}
+
+
+def replaced(text: str) -> str:
+    """The text of a page, its expressions evaluated; large numbers in groups of three digits."""
+
+    def value(found: re.Match[str]) -> str:
+        return format(eval(found[1], NAMES), found[2] or "g").replace(",", " ")
+
+    return re.sub(r"\{\{ (.+?)(?::([^:{}]+))? \}\}", value, text)
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Register with Sphinx."""
+
+    def read(app: Any, name: str, source: list[str]) -> None:
+        source[0] = replaced(source[0])
+
+    app.connect("source-read", read)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
