@@ -33,7 +33,7 @@ from mjxfly.app.host import Library, compile_pair
 from mjxfly.card import Controller, goal_of, limits_of, times_of
 from mjxfly.figures import SETTLING
 from mjxfly.limits import FlightSettings
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
 from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
 
@@ -156,12 +156,12 @@ def hover_on(path: Path, system: str, number: int, fault: str = "") -> Row:
         world.next_flight(0.0, SETTLE)
     start, now = world.state.position.mean(axis=0), 0.0
     if fault:
-        world.fly_until(State.FLY)
+        world.fly_until(FlightState.FLY)
         world.fly_for(2 * SETTLING)
         now = world.now
         injected(fault)(world, 0)
     world.run()
-    flown = [moment for moment in world.track if moment.state == State.FLY.value]
+    flown = [moment for moment in world.track if moment.state == FlightState.FLY.value]
     late = [moment for moment in flown if moment.time > flown[0].time + SETTLING]
     error = np.array([moment.position - start - world.settings.goal for moment in late])
     row = {"positioning": system, "fault": fault, "seed": number, "cause": cause_of(world)}
@@ -193,7 +193,7 @@ def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
         cores=cores_of(path, onboard) if onboard else None,
     )
     world.killed, world.later = False, (math.inf, None)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(SETTLED)
     return world
 
@@ -201,7 +201,7 @@ def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
 def code_of(world: VirtualTwin) -> int:
     """The exit code that the runner's command would have."""
     flight = world.flight
-    return 0 if flight.supervisor.cause is None and flight.lifted and flight.supervisor.state is State.DONE else 1
+    return 0 if flight.supervisor.cause is None and flight.lifted and flight.supervisor.state is FlightState.DONE else 1
 
 
 def cause_of(world: VirtualTwin) -> str:

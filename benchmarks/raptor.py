@@ -41,7 +41,7 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
 from mjxball.physics.step import ControlStep, make_control_step
 from mjxball.plant import plant_parameters
-from mjxball.sim.closed_loop import Commands
+from mjxball.sim.closed_loop import TeamCommands
 from mjxball.sim.rollout import scenario_arrays
 from mjxball.sim.trajectory import Trajectory
 from mjxball.train.run_directory import commit, versions
@@ -108,7 +108,7 @@ def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
     command = 2 * np.clip(state.rotor_force / most, 0.0, 1.0) - 1
     for number, time in enumerate(inputs.time):
         if number % 2 == 0:  # the 50 Hz of every other follower's flights
-            row = Trajectory.of(state, time, goal, Commands(nothing, nothing), diverged=has_diverged(state))
+            row = Trajectory.of(state, time, goal, TeamCommands(nothing, nothing), diverged=has_diverged(state))
             running = metrics.update(running, row, config.scenario.termination_distance, limits, plant.leader)
         seen = [truth(state, plant.leader), measured] if plant.leader < follower else [measured, truth(state, 1)]
         given = np.stack([see(own, mount, goal) for own, mount in zip(seen, mounts, strict=True)], axis=1)

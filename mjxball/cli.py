@@ -20,7 +20,7 @@ from typing import Any
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
-from mjxball.reading import LARGEST, SMALLEST, is_number, shown
+from mjxball.reading import MAX_SIZE, MIN_SIZE, is_number, shown
 from mjxball.terminal import sentence, warn
 from mjxball.xla import explained
 
@@ -76,7 +76,9 @@ def _number(text: str, kind: type[float] | type[int]) -> float:
     with contextlib.suppress(ValueError):
         if is_number(number := kind(text)):
             return number
-    wanted = f"a whole number of at most {LARGEST:g}" if kind is int else f"a number, 0 or {SMALLEST:g} to {LARGEST:g}"
+    wanted = (
+        f"a whole number of at most {MAX_SIZE:g}" if kind is int else f"a number, 0 or {MIN_SIZE:g} to {MAX_SIZE:g}"
+    )
     raise argparse.ArgumentTypeError(f"takes {wanted}, not {shown(text)}")
 
 

@@ -24,7 +24,7 @@ from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
 from mjxball.plant import PlantParameters, plant_parameters
-from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
+from mjxball.sim.closed_loop import ClosedLoop, LoopState, TeamCommands
 from mjxball.sim.disturbances import RandomDisturbances, followers_axis
 from mjxball.sim.follower import follower_law
 from mjxball.sim.randomization import ResetDistribution, Rig
@@ -385,7 +385,7 @@ class TransportEnv:
         return jnp.stack([jnp.broadcast_to(each[self.config.plant.leader], own.shape), own], axis=-1)
 
     def _transition(
-        self, before: PipelineState, after: PipelineState, commands: Commands, terminated: Bool[Array, ""]
+        self, before: PipelineState, after: PipelineState, commands: TeamCommands, terminated: Bool[Array, ""]
     ) -> rewards.Transition:
         """Inputs of the reward of the step from `before` to `after`."""
         plant = after.plant

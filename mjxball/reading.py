@@ -18,7 +18,7 @@ from typing import Any, TypeGuard
 LONGEST_NAME = 60  # characters of a key that a sentence shows
 GAP = 5.0  # median steps; a longer one is a gap of a recording
 STRAY = 0.1  # largest share of rows whose time does not increase
-LARGEST, SMALLEST = 1e12, 1e-30  # of a number other than 0; products beyond are infinite or 0 in float32
+MAX_SIZE, MIN_SIZE = 1e12, 1e-30  # of a number other than 0; products beyond are infinite or 0 in float32
 MOST_DIGITS = 20  # of a whole number of 64 bits; Python takes thousands, which no float holds
 
 
@@ -44,11 +44,11 @@ def _bounded(value: Any) -> Any:
     return _whole(str(value)) if type(value) is int else value
 
 
-def is_number(value: Any, most: float = LARGEST) -> TypeGuard[float]:
-    """Whether `value` is an int or float (no bool) that is 0, or from `SMALLEST` to `most` in size."""
+def is_number(value: Any, most: float = MAX_SIZE) -> TypeGuard[float]:
+    """Whether `value` is an int or float (no bool) that is 0, or from `MIN_SIZE` to `most` in size."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
-    return value == 0 or SMALLEST <= abs(value) <= most
+    return value == 0 or MIN_SIZE <= abs(value) <= most
 
 
 def shown(value: Any) -> str:

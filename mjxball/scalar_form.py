@@ -15,7 +15,7 @@ from jax.extend import core
 
 Value = Any  # an array, or `Parts`
 Parts = Any  # object array, each element a tracer (of the batch, or a scalar) or a NumPy scalar
-LARGEST = 12  # size; operations on larger arrays are kept, since in scalar form they compile longer and run no faster
+MAX_ITEMS = 12  # size; operations on larger arrays are kept, since in scalar form they compile longer and run no faster
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 ELEMENTWISE = frozenset(
     (
@@ -41,7 +41,7 @@ def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
     Slices, stacks and transposes of small arrays vanish, and so do products with constants that are 0 (0 times infinity
     is then 0). Sums are added in order. A `lax.scan` without inputs and outputs for each step, such as `fori_loop` of a
     fixed count, is recomputed for its gradient instead of storing intermediate values. Operations that are unknown here
-    or have an array larger than `LARGEST` are kept, and so is a call (`jax.jit`) that contains one.
+    or have an array larger than `MAX_ITEMS` are kept, and so is a call (`jax.jit`) that contains one.
     The result has reverse-mode gradients only (`jax.grad`, `jax.vjp`).
     """
 
@@ -68,7 +68,7 @@ def _split(leaves: Sequence[Any]) -> list[Value]:
     small = [
         k
         for k, leaf in enumerate(leaves)
-        if jnp.ndim(leaf) > 1 and 0 < leaf.size // len(leaf) <= LARGEST and jnp.issubdtype(leaf.dtype, jnp.floating)
+        if jnp.ndim(leaf) > 1 and 0 < leaf.size // len(leaf) <= MAX_ITEMS and jnp.issubdtype(leaf.dtype, jnp.floating)
     ]
     shapes = [leaves[k].shape for k in small]
 
@@ -119,7 +119,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     name, parameters = equation.primitive.name, equation.params
     if name in CALLS and parameters.get(CALLS[name]) is not None:
         called = parameters[CALLS[name]]
-        if _largest(called.jaxpr) > LARGEST:
+        if _largest(called.jaxpr) > MAX_ITEMS:
             return _on_arrays(equation, inputs)
         return _evaluate(called.jaxpr, called.consts, inputs)
     if name == "scan" and _repeats(equation):
@@ -130,7 +130,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     rewritten = (name in ELEMENTWISE and broadcasts) or name in REDUCTIONS or name in REARRANGED
     keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
     sizes = [aval.size for aval in avals]
-    if keys or not rewritten or max(sizes) > LARGEST or min(sizes) == 0:
+    if keys or not rewritten or max(sizes) > MAX_ITEMS or min(sizes) == 0:
         return _on_arrays(equation, inputs)
     parts = [_parts(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
     if name in REARRANGED:

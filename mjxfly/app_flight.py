@@ -13,7 +13,7 @@ import numpy as np
 
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxfly.app.protocol import CANNOT_FLY, GROUP, AppSample, Phase, order, reason, upload
+from mjxfly.app.protocol import CANNOT_FLY, GROUP, AppPhase, AppSample, order, reason, upload
 from mjxfly.connection import LinkError
 from mjxfly.flight import Flight
 from mjxfly.limits import NAMES, Check, FlightSettings
@@ -21,7 +21,7 @@ from mjxfly.link import Link
 from mjxfly.monitor import UplinkWatch
 from mjxfly.packets import ZERO, Setpoint
 from mjxfly.setpoints import CURVE_NAMES, CurveName, Mapped, Variant, Variants
-from mjxfly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, State
+from mjxfly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, FlightState
 from mjxfly.takeoff import STUCK
 from mjxfly.telemetry import DroneLink, Rig, object_state
 
@@ -86,21 +86,21 @@ def send_weights(link: Link, weights: bytes, key: int, say: Callable[[str], None
 
 
 ORDERS = {
-    State.SPIN: Phase.SPIN,
-    State.RAMP: Phase.RAMP,
-    State.FLY: Phase.FLY,
-    State.LAND: Phase.LAND,
-    State.DESCEND: Phase.DESCEND,
-    State.HOLD: Phase.LAND,
-    State.STOP: Phase.STOP,
-    State.KILL: Phase.STOP,
+    FlightState.SPIN: AppPhase.SPIN,
+    FlightState.RAMP: AppPhase.RAMP,
+    FlightState.FLY: AppPhase.FLY,
+    FlightState.LAND: AppPhase.LAND,
+    FlightState.DESCEND: AppPhase.DESCEND,
+    FlightState.HOLD: AppPhase.LAND,
+    FlightState.STOP: AppPhase.STOP,
+    FlightState.KILL: AppPhase.STOP,
 }
 # Event for a phase that an app enters by itself, while the laptop flies or lands.
 PHASE_EVENTS = {
-    Phase.LAND: Event.APP_LANDS,
-    Phase.DESCEND: Event.APP_DESCENDS,
-    Phase.STOP: Event.APP_STOPS,
-    Phase.IDLE: Event.APP_STOPS,
+    AppPhase.LAND: Event.APP_LANDS,
+    AppPhase.DESCEND: Event.APP_DESCENDS,
+    AppPhase.STOP: Event.APP_STOPS,
+    AppPhase.IDLE: Event.APP_STOPS,
 }
 LANDED = (reason(1), reason(2), reason(18))  # causes of a stop that was requested, or that follows a touchdown
 # Events that the apps handle, or that only apply to setpoints sent by the laptop.
@@ -143,14 +143,14 @@ class OnboardFlight(Flight):
         if self.supervisor.state in GUIDED:
             seen = object_state(self._states, self.rig)
             self._highest_place = max(self._highest_place, self._height(seen))
-            if self.supervisor.state is State.FLY:
+            if self.supervisor.state is FlightState.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
                 self.flown.update(self._now, self.elapsed, distance, rotations.tilt_of_quaternion(seen.quaternion))
         return None, []
 
     def _is_airborne(self) -> bool:
         """True once an app reports that its controller flies."""
-        return self.settings.dry_run or any(app is not None and app.phase >= Phase.FLY for app in self._apps())
+        return self.settings.dry_run or any(app is not None and app.phase >= AppPhase.FLY for app in self._apps())
 
     def _stuck_message(self) -> str:
         return f"{STUCK}: is it heavier, or does a propeller give less?"
@@ -186,7 +186,7 @@ class OnboardFlight(Flight):
     def _before_lift(self, fault: Fault) -> Fault | None:
         """`fault`, or None for CURVE_KNOWN until both apps have reached SPIN: thrust must not rise before."""
         early = fault.event is Event.CURVE_KNOWN and not self.settings.dry_run
-        return None if early and any(app is None or app.phase is not Phase.SPIN for app in self._apps()) else fault
+        return None if early and any(app is None or app.phase is not AppPhase.SPIN for app in self._apps()) else fault
 
     def _apps(self) -> list[AppSample | None]:
         """Newest log sample of each app, None if there is none younger than `STATE_AGE`."""
@@ -200,10 +200,10 @@ class OnboardFlight(Flight):
             if app is None:
                 continue
             self._note_app(name, app)
-            if state is State.SPIN and self.elapsed > STATE_AGE and app.phase <= Phase.SPIN and app.refusal:
+            if state is FlightState.SPIN and self.elapsed > STATE_AGE and app.phase <= AppPhase.SPIN and app.refusal:
                 found.append(Fault(Event.APP_REFUSES, f"{name}: {reason(app.refusal)}"))
             elif state in AIRBORNE and app.phase in PHASE_EVENTS and self.elapsed > STATE_AGE / 2:
-                ended = app.phase in (Phase.STOP, Phase.IDLE) and state in (State.LAND, State.DESCEND)
+                ended = app.phase in (AppPhase.STOP, AppPhase.IDLE) and state in (FlightState.LAND, FlightState.DESCEND)
                 event = Event.TOUCHED_DOWN if ended and reason(app.cause) in LANDED else PHASE_EVENTS[app.phase]
                 found.append(Fault(event, f"{name}: {reason(app.cause)}"))
         if self.settings.dry_run:

@@ -152,7 +152,7 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
     return leader, follower
 
 
-class Commands(NamedTuple):
+class PairCommands(NamedTuple):
     """Commands of both controllers at one control step."""
 
     leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
@@ -180,11 +180,11 @@ class Controller:
         """Integrals of both controllers, see `sim.laws.Laws`."""
         return self._integral
 
-    def step(self, state: Body, goal: np.ndarray) -> Commands:
+    def step(self, state: Body, goal: np.ndarray) -> PairCommands:
         """Commands at `state` for the `goal` (3,) of O [m]. Call it once per control period."""
         observation = self._loop.observe(state, goal)
         leader = self._loop.leader_command(state, goal, self._integral)
         action = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
         follower = self._loop.follower_command(rotations.turned_about_z(action, self._angle), self._integral)
         self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=follower)
-        return Commands(leader, follower, observation, self.policy.hidden)
+        return PairCommands(leader, follower, observation, self.policy.hidden)

@@ -23,7 +23,7 @@ from mjxfly.parameters import is_written
 from mjxfly.telemetry import Rig
 from mjxfly.uri import check_pair, parse_uri
 
-LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
+MAX_FILE_BYTES, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
 MERGE = "tag:yaml.org,2002:merge"  # the key <<
 VERSIONS = (1, 2, 3)  # of the file
 NEAR = 0.1  # [m] tolerance of the initial positions against the mounts
@@ -156,7 +156,7 @@ def _parsed(path: Path) -> Any:
                 raise ValueError(f"it has more than {MOST_ALIASES} aliases, *name")
             return super().compose_node(parent, index)
 
-    text = read_text(path, "Crazyswarm2 file", LARGEST)
+    text = read_text(path, "Crazyswarm2 file", MAX_FILE_BYTES)
     try:
         return yaml.load(text, Loader)
     except yaml.MarkedYAMLError as error:

@@ -22,7 +22,7 @@ from mjxball.terminal import columns_of, fitted_to, is_live
 from mjxfly.limits import NAMES, Limits
 from mjxfly.packets import DroneState, Setpoint
 from mjxfly.process import Child
-from mjxfly.supervisor import ENDED, GUIDED, State, Supervisor
+from mjxfly.supervisor import ENDED, GUIDED, FlightState, Supervisor
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
 PERIOD = 0.2  # [s]
@@ -46,7 +46,7 @@ def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -
     """`view` as lines that fit a terminal of `columns`; danger is white on red."""
     state = view.supervisor.state
     code = GREEN if state in GUIDED and view.supervisor.cause is None else YELLOW
-    code = RED if view.supervisor.cause is not None or state in (State.HOLD, State.KILL) else code
+    code = RED if view.supervisor.cause is not None or state in (FlightState.HOLD, FlightState.KILL) else code
     cause = view.supervisor.cause
     why = f" {cause.event.name} {cause.detail}" if cause else ""
     timing = f"loop {1000 * view.late:5.2f} ms late, {view.missed} missed/s"

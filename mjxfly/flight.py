@@ -11,7 +11,7 @@ import numpy as np
 
 from mjxball.control import rotations
 from mjxfly import packets, probe, setpoints
-from mjxfly.card import Commands, Controller
+from mjxfly.card import Controller, PairCommands
 from mjxfly.display import View
 from mjxfly.ending import Ending
 from mjxfly.figures import Flown
@@ -22,7 +22,7 @@ from mjxfly.monitor import Monitor, Sustained, UplinkWatch, link_faults
 from mjxfly.packets import ZERO, PacketError, Setpoint
 from mjxfly.preflight import SpinCheck
 from mjxfly.setpoints import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
-from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State, Supervisor
+from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, FlightState, Supervisor
 from mjxfly.takeoff import TakeOff
 from mjxfly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxfly.watchdog import Watchdog
@@ -61,7 +61,7 @@ class Flight:
         self._sent: list[Setpoint] = [ZERO, ZERO]
         self._hover_scale = (1.0, 1.0)  # hover force of leader and follower over nominal, found at take-off
         self._trims = [0.0, 0.0]  # hover thrust [units]: a running average of the sent thrust
-        self._commands: Commands | None = None
+        self._commands: PairCommands | None = None
         self._every = max(round(controller.period / settings.period), 1)  # ticks per command
         self._count = 0
         self._monitor = Monitor(rig, settings)
@@ -108,7 +108,7 @@ class Flight:
         """Start the flight at `now` [s] from the pair's present position; both links must have a state."""
         self._read(now)
         self._start, self._monitor.origin = now, object_state(self._states, self.rig).position
-        self.supervisor = Supervisor(State.CHECK, now)
+        self.supervisor = Supervisor(FlightState.CHECK, now)
 
     def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
         """Do one period: read states, find faults, advance the supervisor, send, log. False once the flight is done.
@@ -129,7 +129,7 @@ class Flight:
         self._transmit(wanted)
         self._record(wanted, late, missed)
         self._count += 1
-        return self.supervisor.state is not State.DONE
+        return self.supervisor.state is not FlightState.DONE
 
     def _note_ending(self, faults: list[Fault], gap: float) -> None:
         self.ending.update(faults, self.supervisor, self._now, gap)
@@ -179,7 +179,7 @@ class Flight:
             volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
             faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
         # Also on the ground once motors turn: the loop may hang in the tick that begins the ramp.
-        guarded = self.flying or (self.supervisor.state is State.SPIN and not self.settings.dry_run)
+        guarded = self.flying or (self.supervisor.state is FlightState.SPIN and not self.settings.dry_run)
         if self.watchdog is not None and not self.watchdog.beat(guarded, self._last_known_state()):
             faults.append(Fault(Event.WATCHDOG))
         return faults
@@ -223,7 +223,7 @@ class Flight:
             return None, []
         try:
             seen = object_state(self._states, self.rig)
-            if self.supervisor.state is State.FLY:
+            if self.supervisor.state is FlightState.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
                 nominal = [own.map.hover_thrust for own in self.spin.chosen()]
                 one, other = (sent.thrust / hover for sent, hover in zip(self._sent, nominal, strict=True))
@@ -247,7 +247,7 @@ class Flight:
         goal = self._monitor.origin + np.array(self.settings.goal)
         if self._probes:
             goal[2] = self._monitor.origin[2] + min(self.settings.goal[2], probe.HEIGHT)
-        if self.supervisor.state is State.LAND:
+        if self.supervisor.state is FlightState.LAND:
             sunk = self.settings.times.land_speed * (now - self.supervisor.since)
             goal[2] = max(self._monitor.origin[2] + self._land_height - sunk, self._monitor.origin[2] - 1.0)
         return goal
@@ -260,7 +260,7 @@ class Flight:
     @property
     def _probes(self) -> bool:
         """True at the beginning of FLY on motion capture: the measured axes are not verified yet."""
-        return self._mocap is not None and self.supervisor.state is State.FLY and self.elapsed < probe.TIME
+        return self._mocap is not None and self.supervisor.state is FlightState.FLY and self.elapsed < probe.TIME
 
     def _probe(self) -> np.ndarray:
         return probe.command(self.elapsed, self.rig.span) if self._probes else np.zeros(3)
@@ -277,21 +277,23 @@ class Flight:
         heard = all(self._fresh) and all(watch.hears for watch in self._monitor.uplinks)
         resumes = heard and self.supervisor.may_resume and not (hindered or self._landed())
         reached = {
-            Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
-            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_airborne(),
-            Event.TIME_UP: state is State.FLY and elapsed >= self.settings.seconds,
-            Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._landed(),
-            Event.RESUMED: state is State.HOLD and self._recovered.update(resumes, self._now),
-            Event.GROUNDED: state is State.STOP and elapsed >= times.stop and not flying,
+            Event.ARMED: state is FlightState.ARM and elapsed >= times.arm and armed,
+            Event.HOVERING: state is FlightState.RAMP and elapsed >= times.ramp and self._is_airborne(),
+            Event.TIME_UP: state is FlightState.FLY and elapsed >= self.settings.seconds,
+            Event.TOUCHED_DOWN: state in (FlightState.LAND, FlightState.DESCEND)
+            and elapsed >= times.settled
+            and self._landed(),
+            Event.RESUMED: state is FlightState.HOLD and self._recovered.update(resumes, self._now),
+            Event.GROUNDED: state is FlightState.STOP and elapsed >= times.stop and not flying,
         }
         events = [Fault(event) for event, is_reached in reached.items() if is_reached]
-        if state is State.CHECK and self.ready is not None:
+        if state is FlightState.CHECK and self.ready is not None:
             events.append(Fault(Event.READY if self.ready else Event.REFUSED, self.refusal))
-        if state is State.SPIN and elapsed >= times.spin:
+        if state is FlightState.SPIN and elapsed >= times.spin:
             known = [Fault(Event.CURVE_KNOWN, "dry run")] if dry else None
             events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
         if elapsed >= self._limit(state):
-            stuck = state is State.RAMP and not self._is_airborne()
+            stuck = state is FlightState.RAMP and not self._is_airborne()
             text = self._stuck_message() if stuck else f"{state.value} lasted {elapsed:.1f} s"
             events.append(Fault(Event.TIMEOUT, text))
         return events
@@ -299,12 +301,12 @@ class Flight:
     def _stuck_message(self) -> str:
         return self._take_off.stuck(self.maps)
 
-    def _limit(self, state: State) -> float:
+    def _limit(self, state: FlightState) -> float:
         """How long a state may last [s]."""
         times = self.settings.times
         landing = (self._land_height + 0.3) / times.land_speed + times.land_spare
-        own = {State.FLY: self.settings.seconds + 1.0, State.LAND: landing}
-        own |= {State.HOLD: self._hold_for, State.DESCEND: self._descend_for}
+        own = {FlightState.FLY: self.settings.seconds + 1.0, FlightState.LAND: landing}
+        own |= {FlightState.HOLD: self._hold_for, FlightState.DESCEND: self._descend_for}
         return own.get(state, times.limits.get(state, math.inf))
 
     def _advance(self, faults: list[Fault]) -> None:
@@ -317,16 +319,16 @@ class Flight:
             return
         names = [f"{fault.event.name}: {fault.detail}" if fault.detail else fault.event.name for fault in faults]
         self.note("transition", self._now, before=before.state.value, after=entered.value, events=names)
-        if entered is State.FLY and before.state is State.RAMP:
+        if entered is FlightState.FLY and before.state is FlightState.RAMP:
             self.controller.reset()
             self._commands, self._hover_scale = None, self._take_off.needed([one.quaternion for one in self._states])
-        if entered is State.LAND and before.state is not State.HOLD:
+        if entered is FlightState.LAND and before.state is not FlightState.HOLD:
             self._land_height = self._height(self._object())
-        if entered is State.DESCEND:
+        if entered is FlightState.DESCEND:
             highest = max(filter(math.isfinite, self._heights), default=0.0)  # the newest height may be the fault
             self._descend_for = self.settings.times.descent_limit(highest)
             self._plan = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
-        if entered is State.HOLD:
+        if entered is FlightState.HOLD:
             self._hold(faults)
 
     def _hold(self, faults: list[Fault]) -> None:
@@ -348,32 +350,32 @@ class Flight:
         state = self.supervisor.state
         if state in GUIDED:
             return [one.setpoint for one in mapped] if mapped else list(self._sent)
-        if state is State.SPIN:
+        if state is FlightState.SPIN:
             return [setpoints.level(SPIN_THRUST)] * 2
-        if state is State.RAMP:
+        if state is FlightState.RAMP:
             rising = self._object()
             return self._take_off.wanted(self.elapsed, rising, self._height(rising), self.maps)
-        if state not in (State.DESCEND, State.HOLD):
+        if state not in (FlightState.DESCEND, FlightState.HOLD):
             return [ZERO, ZERO]
         # The same for both drones: brake sideways and sink by the measured velocity, by the plan if there is none.
         seen, tilt = self._trusted(), (0.0, 0.0)
-        if state is State.HOLD and not any(map(operator.and_, self._monitor.estimators.trusted, self._fresh)):
+        if state is FlightState.HOLD and not any(map(operator.and_, self._monitor.estimators.trusted, self._fresh)):
             seen = None  # no trusted estimate is fresh
         if seen is not None and not (self.settings.stand or self._monitor.estimators.contradiction):
             tilt = setpoints.brake(seen.velocity)
-        if seen is not None and state is State.DESCEND:
+        if seen is not None and state is FlightState.DESCEND:
             share = setpoints.sinking_share(float(seen.velocity[2]), self.settings.times)
         elif seen is not None:
             share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._plan[min(int(self.elapsed / self.settings.period), len(self._plan) - 1)]
-        shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
+        shares = self._lift.shared(share, seen, self.rig) if state is FlightState.DESCEND else [share] * 2
         return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
         """Update the hover thrusts, and send setpoints and the commands of the supervisor's state."""
         state, dry = self.supervisor.state, self.settings.dry_run
-        if state is State.RAMP:
+        if state is FlightState.RAMP:
             rises = zip(wanted, self.maps, strict=True)
             self._trims = [min(float(s.thrust), setpoints.MOST_TRIM * c.hover_thrust) for s, c in rises]
         elif state in GUIDED:
@@ -384,13 +386,13 @@ class Flight:
         self.highest = [max(most, value.thrust) for most, value in zip(self.highest, wanted, strict=True)]
         sometimes = self._count % 10 == 0 and not dry
         for link, watch, value, own in zip(self.links, self._monitor.uplinks, wanted, self._states, strict=True):
-            if state is State.STOP and self.elapsed < self.settings.times.stop:
+            if state is FlightState.STOP and self.elapsed < self.settings.times.stop:
                 link.command(packets.STOP)
-            elif state is State.KILL and not dry:
+            elif state is FlightState.KILL and not dry:
                 link.command(packets.EMERGENCY_STOP)
-            if state in (State.STOP, State.DONE) and sometimes and not own.info & packets.AUTO_ARMED:
+            if state in (FlightState.STOP, FlightState.DONE) and sometimes and not own.info & packets.AUTO_ARMED:
                 link.command(packets.DISARM)  # motors idle until disarmed; one that arms itself would arm again
-            elif state is State.ARM and sometimes:
+            elif state is FlightState.ARM and sometimes:
                 link.command(packets.ARM)
             self._send(link, watch, ZERO if dry else value)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.control.motors import MOTORS, Motor
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.telemetry import Rig
 
 STAND_SPARE = 0.25  # [m] above the goal: ceiling of a flight on the stand
@@ -79,14 +79,14 @@ class Times:
         return max(self.descend_least, self.descend_share * height / self.descend_speed)
 
     @property
-    def limits(self) -> dict[State, float]:
+    def limits(self) -> dict[FlightState, float]:
         """Time limits [s] of the states whose limit is the same in every flight."""
         return {
-            State.ARM: self.arm_limit,
-            State.SPIN: self.spin_limit,
-            State.RAMP: self.ramp + self.lift,
-            State.STOP: self.stop_limit,
-            State.KILL: self.stop,
+            FlightState.ARM: self.arm_limit,
+            FlightState.SPIN: self.spin_limit,
+            FlightState.RAMP: self.ramp + self.lift,
+            FlightState.STOP: self.stop_limit,
+            FlightState.KILL: self.stop,
         }
 
 
@@ -94,7 +94,7 @@ class Times:
 class FlightSettings:
     """Duration, goal, loop period, motors and bounds of a flight."""
 
-    seconds: float = 20.0  # in State.FLY
+    seconds: float = 20.0  # in FlightState.FLY
     goal: tuple[float, float, float] = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
     dry_run: bool = False  # send zero setpoints only
     period: float = 0.01  # of the loop [s]

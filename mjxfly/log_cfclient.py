@@ -18,7 +18,8 @@ from mjxfly.limits import NAMES
 from mjxfly.log_consistency import known
 from mjxfly.log_sources import VARIABLES, WIDTHS, Samples, Series
 
-LARGEST, MOST_COLUMNS = 64 * 2**20, 100  # of a file [bytes]: hours of a log block; a packet holds fewer variables
+MAX_FILE_BYTES = 64 * 2**20  # some hours of a log block
+MOST_COLUMNS = 100  # the variables of a log block fit a packet
 
 
 def read_cfclient(path: Path, remark: Callable[[str], None]) -> Series:
@@ -45,7 +46,7 @@ def _columns(folder: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
 
 def _read_csv(file: Path, remark: Callable[[str], None]) -> dict[str, Samples]:
     with contextlib.suppress(csv.Error):
-        reader = csv.reader(io.StringIO(read_text(file, "", LARGEST), newline=""))
+        reader = csv.reader(io.StringIO(read_text(file, "", MAX_FILE_BYTES), newline=""))
         head = next(reader, [])
         if head[:1] != ["Timestamp"]:
             raise InputError(f"{file} begins with {','.join(head)[:40]!r}; expected cfclient's Timestamp and variables")

@@ -24,7 +24,7 @@ from mjxfly.log_rows import IMPOSSIBLE, NEEDED, Drone, at, attitude, called, sou
 from mjxfly.log_schema import SCHEMA, Record, StatePacket
 from mjxfly.log_sources import TOPICS, VARIABLES, Samples
 from mjxfly.packets import DroneState
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.telemetry import Rig
 
 UNKNOWN = "an unknown follower"  # policy name of a flight that another program recorded
@@ -182,7 +182,7 @@ def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent:
     goal = np.full(3, np.nan)
     for now, own, row in zip(times[latest >= 0], leader[latest >= 0], latest[latest >= 0], strict=True):
         setpoints = np.stack([own, follower[row]])
-        state = State.FLY if (setpoints[:, 3] > 0).all() else State.DONE
+        state = FlightState.FLY if (setpoints[:, 3] > 0).all() else FlightState.DONE
         found.append({"t": float(now), "kind": "tick", "state": state.value, "goal": goal, "sent": setpoints})
     found.sort(key=lambda one: float(one["t"]))
     first, last = found[0]["t"], found[-1]["t"]

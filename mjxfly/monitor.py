@@ -18,7 +18,7 @@ from mjxfly import packets
 from mjxfly.limits import NAMES, FlightSettings, Limits
 from mjxfly.measured import REPEATING, DroneWatch
 from mjxfly.packets import DroneState, Health
-from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State
+from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, FlightState
 from mjxfly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
 # Thresholds at which an estimator is not trusted, or a drone counts as not hearing.
@@ -32,12 +32,18 @@ LIMITS = Limits()
 ECHO = 0.3  # [s] within which a sent thrust is reported back as the one in force
 RECENT = 0.1  # [s] of sent thrusts with which a constant thrust in force is compared
 ROUNDING = 1.5  # [thrust units] rounding tolerance between two equal thrusts
-CLOSED = (State.RAMP, *GUIDED)  # the thrust depends on the estimates; before, the streams of a pair at rest may freeze
+CLOSED = (
+    FlightState.RAMP,
+    *GUIDED,
+)  # the thrust depends on the estimates; before, the streams of a pair at rest may freeze
 # [s] after CLOSED in which a stream may freeze by the same cause. Later a frozen estimate still steers a descent better
 # than none, since the blind descent would start in its middle.
 TOGETHER = 0.1
 FROZEN = 0.1  # [s] without change of its states after which a drone that does not hear counts as frozen
-RISING = (State.RAMP, State.FLY)  # contact with the ground causes accelerations that the packets do not resolve
+RISING = (
+    FlightState.RAMP,
+    FlightState.FLY,
+)  # contact with the ground causes accelerations that the packets do not resolve
 UNHEARD = 4  # consecutive health packets without an echo, or with a constant one
 
 
@@ -101,7 +107,7 @@ class Monitor:
         self.object: ObjectState | None = None  # newest trusted state
         self._closed_at = -math.inf  # [s] last time in a state of `CLOSED`
 
-    def update(self, phase: State, links: Sequence[DroneLink], ages: Sequence[float], now: float) -> list[Fault]:
+    def update(self, phase: FlightState, links: Sequence[DroneLink], ages: Sequence[float], now: float) -> list[Fault]:
         """Faults in the supervisor's state `phase` at `now` [s]; `ages` (2,) [s] are those of the states."""
         samples = [link.telemetry.newest for link in links if link.telemetry.newest is not None]
         healths = [link.telemetry.health for link in links]
@@ -115,7 +121,7 @@ class Monitor:
                 found = watch.update(*health) if health is not None else []
                 faults += [watch.frozen] if found and drone.stands(FROZEN) else found
         self.object = self.estimators.object(samples, fresh) or self.object
-        bounds = self._hold_limits if phase is State.HOLD else self._settings.limits
+        bounds = self._hold_limits if phase is FlightState.HOLD else self._settings.limits
         states = [sample.state for sample in samples]
         for name, state, known in zip(NAMES, states, fresh, strict=True):
             faults += self._from_state(name, state, bounds, phase not in ON_GROUND and not dry) if known else []
@@ -130,7 +136,7 @@ class Monitor:
         orders = [(name, watch.imu.not_shown()) for name, watch in zip(NAMES, self._drones, strict=True)]
         return next((f"{order} within a second (the {name} has not shown it)" for name, order in orders if order), "")
 
-    def _measured(self, phase: State, links: Sequence[DroneLink], now: float) -> list[Fault]:
+    def _measured(self, phase: FlightState, links: Sequence[DroneLink], now: float) -> list[Fault]:
         """Faults of frozen streams and of contradictions to the IMU; updated on the ground too, reported in flight."""
         found = []
         for number, (name, link, watch) in enumerate(zip(NAMES, links, self._drones, strict=True)):

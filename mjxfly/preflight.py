@@ -285,7 +285,7 @@ def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
 
 
 class SpinCheck:
-    """Recognises the force curves of both drones' firmwares. `update` once a tick in State.SPIN."""
+    """Recognises the force curves of both drones' firmwares. `update` once a tick in FlightState.SPIN."""
 
     def __init__(
         self, links: Sequence[DroneLink], variants: Sequence[Variants], assumed: Sequence[CurveName], motor: Motor

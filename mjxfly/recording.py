@@ -23,7 +23,7 @@ from mjxfly.log_consistency import SILENCE
 from mjxfly.log_schema import Record
 from mjxfly.packets import DroneState
 from mjxfly.setpoints import CURVE_NAMES, CurveName, ForceCurve
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.telemetry import ObjectState, Rig, object_state
 from mjxfly.twin.conditions import DroneKind, Surroundings, drone_kind
 from mjxfly.twin.pair import PairState
@@ -31,7 +31,7 @@ from mjxfly.twin.physics import pair_of
 
 FROZEN = 0.25  # [s] of equal states after which an estimator counts as frozen while the controllers are in command
 OFF_RATE = 0.2  # relative deviation of the tick period from the policy's that is reported
-GUIDED = State.FLY.value  # both controllers are in command
+GUIDED = FlightState.FLY.value  # both controllers are in command
 LONGEST = 3600.0  # [s] longest flight that is read
 OBSERVATION = 18  # length of an observation if the log has none
 SAME = 1e-5  # relative tolerance between equal gains, of which one was sent as a 32-bit float
@@ -235,7 +235,7 @@ class Recording:
     @property
     def target(self) -> np.ndarray:
         """(T, 3) the goal [m]; while landing the last one before, not the one that sinks below the ground."""
-        rows = np.where([phase == State.LAND.value for phase in self.phase], 0, np.arange(len(self.phase)))
+        rows = np.where([phase == FlightState.LAND.value for phase in self.phase], 0, np.arange(len(self.phase)))
         return np.asarray(self.goal[np.maximum.accumulate(rows)])
 
     @property

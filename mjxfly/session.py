@@ -32,7 +32,7 @@ from mjxfly.preflight import Preflight, check, prepare
 from mjxfly.process import Metronome, Timing, bounded, together, urgent
 from mjxfly.rehearsal import Rehearsal, RehearsalError
 from mjxfly.setpoints import CurveName, Variants
-from mjxfly.supervisor import Event, Fault, State, Supervisor
+from mjxfly.supervisor import Event, Fault, FlightState, Supervisor
 from mjxfly.telemetry import Rig
 from mjxfly.twin.drone import only_kept
 from mjxfly.warm_up import warm_up
@@ -190,7 +190,7 @@ def _emergency(flight: Flight) -> None:
             link.command(packets.EMERGENCY_STOP)
             link.send(packets.setpoint_packet(packets.ZERO))
         clock.sleep(0.01)
-    flight.supervisor = Supervisor(State.DONE, clock.now(), Fault(Event.BAD_STATE, "the runner itself failed"))
+    flight.supervisor = Supervisor(FlightState.DONE, clock.now(), Fault(Event.BAD_STATE, "the runner itself failed"))
 
 
 def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings, journal: Journal) -> bool:

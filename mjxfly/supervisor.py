@@ -10,7 +10,7 @@ from enum import Enum
 from typing import NamedTuple
 
 
-class State(Enum):
+class FlightState(Enum):
     """State of the flight, by what is sent to both drones."""
 
     CHECK = "check"  # zeros, during the preflight checks
@@ -28,7 +28,7 @@ class State(Enum):
     @property
     def severity(self) -> int:
         """Precedence if one tick has several events. Only HOLD can lead back, to the state that it interrupted."""
-        return list(State).index(self)
+        return list(FlightState).index(self)
 
 
 class Event(Enum):
@@ -81,7 +81,7 @@ class Fault(NamedTuple):
         return self.event.name.lower().replace("_", " ") + (f": {self.detail}" if self.detail else "")
 
 
-S, E = State, Event
+S, E = FlightState, Event
 BEFORE_MOTORS = (S.CHECK, S.ARM)
 ON_GROUND = (*BEFORE_MOTORS, S.SPIN)
 GUIDED = (S.FLY, S.LAND)  # leader and follower controllers are in command
@@ -96,7 +96,7 @@ _CONTROLLED = (
 )
 
 
-def _planned() -> dict[tuple[State, Event], State]:
+def _planned() -> dict[tuple[FlightState, Event], FlightState]:
     """Transitions of a normal flight, with those on request."""
     return {
         (S.CHECK, E.READY): S.ARM,
@@ -116,14 +116,14 @@ def _planned() -> dict[tuple[State, Event], State]:
     }
 
 
-def _on_the_ground() -> dict[tuple[State, Event], State]:
+def _on_the_ground() -> dict[tuple[FlightState, Event], FlightState]:
     """Before the pair can lift, any fault stops the motors."""
     harmless = PLANNED | {E.SATURATED, E.DEADLINES, E.TIMEOUT, E.INTERRUPT}
     wrong = {(state, event): S.STOP for state in ON_GROUND for event in E if event not in harmless}
     return wrong | {(state, event): S.STOP for state in ON_GROUND for event in (E.TIMEOUT, E.INTERRUPT)}
 
 
-def _in_the_air() -> dict[tuple[State, Event], State]:
+def _in_the_air() -> dict[tuple[FlightState, Event], FlightState]:
     """In the air: land or descend under control, hold if a drone is not heard, stop if one cannot be controlled."""
     table = {(S.FLY, event): S.LAND for event in (E.BATTERY, E.WATCHDOG, E.GAPS)}
     table |= {(S.RAMP, event): S.DESCEND for event in (E.BATTERY, E.WATCHDOG, E.GAPS, E.TIMEOUT)}
@@ -139,7 +139,7 @@ def _in_the_air() -> dict[tuple[State, Event], State]:
     return table
 
 
-def _table() -> dict[tuple[State, Event], State]:
+def _table() -> dict[tuple[FlightState, Event], FlightState]:
     """All transitions; other pairs keep the state. The kill key works in every state but DONE."""
     kill = {(state, E.KEY_KILL): S.KILL for state in S if state is not S.DONE}
     return _planned() | _on_the_ground() | _in_the_air() | kill
@@ -155,10 +155,10 @@ FAULTS = frozenset(E) - PLANNED - {E.INTERRUPT, E.TIMEOUT}
 class Supervisor:
     """State machine: state, time of entry, cause of an abort. Immutable: `after` returns the next one."""
 
-    state: State = State.CHECK
+    state: FlightState = FlightState.CHECK
     since: float = 0.0  # [s]
     cause: Fault | None = None  # first fault of an abort
-    held: tuple[State, float] | None = None  # state that HOLD interrupted, and its time of entry [s]
+    held: tuple[FlightState, float] | None = None  # state that HOLD interrupted, and its time of entry [s]
 
     def after(self, faults: list[Fault], now: float) -> Supervisor:
         """The supervisor after the `faults` of one tick at `now` [s]."""
@@ -173,7 +173,7 @@ class Supervisor:
             return self._resumed(now)
         unplanned = why.event in FAULTS or (self.state in SHORT and why.event is Event.TIMEOUT)
         first = self.cause or (why if unplanned else None)
-        held = (self.state, self.since) if best is State.HOLD else None
+        held = (self.state, self.since) if best is FlightState.HOLD else None
         return Supervisor(best, now, first, held)
 
     @property
@@ -188,6 +188,6 @@ class Supervisor:
 
     def _resumed(self, now: float) -> Supervisor:
         """Back to the state that HOLD interrupted, with no cause if it was a gap; to DESCEND if it was the ramp."""
-        state, since = self.held or (State.DESCEND, now)
+        state, since = self.held or (FlightState.DESCEND, now)
         cause = None if self._gap else self.cause
-        return Supervisor(state, since, cause) if state in GUIDED else Supervisor(State.DESCEND, now, self.cause)
+        return Supervisor(state, since, cause) if state in GUIDED else Supervisor(FlightState.DESCEND, now, self.cause)

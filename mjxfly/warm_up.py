@@ -14,7 +14,7 @@ from mjxfly.flight import Flight
 from mjxfly.limits import FlightSettings
 from mjxfly.packets import Packet
 from mjxfly.setpoints import CurveName, Variants
-from mjxfly.supervisor import Event, Fault, State, Supervisor
+from mjxfly.supervisor import Event, Fault, FlightState, Supervisor
 from mjxfly.telemetry import DroneLink, Rig, Telemetry
 
 TICKS = 6  # in each state: longer than a command lasts
@@ -60,7 +60,7 @@ def warm_up(
     deaf = [Deaf(link.telemetry) for link in links]
     flight = kind(deaf, controller, variants, assumed, rig, settings, lambda *_, **__: None)
     flight.begin(now)
-    for state in State:
+    for state in FlightState:
         cause = Fault(Event.STALE, "of a rehearsal on the ground")
         for number in range(TICKS):
             now += STEP

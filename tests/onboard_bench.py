@@ -18,8 +18,8 @@ from mjxball.export import in_team
 from mjxball.policy import PolicyFile, load_file
 from mjxball.policy.file import law_of, shipped_policy
 from mjxfly.app import host, protocol
-from mjxfly.app.host import App, Library, State, compile_pair
-from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app.host import App, Library, OnboardState, compile_pair
+from mjxfly.app.protocol import CAUSES, AppPhase
 from mjxfly.telemetry import ObjectState, Rig
 
 NO_GCC = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc is installed")
@@ -82,16 +82,16 @@ class Bench:
             for axis, value in zip("XYZ", mount, strict=True):
                 app.set(f"mount{axis}", value)
 
-    def state(self, pair: ObjectState, mount: np.ndarray) -> State:
+    def state(self, pair: ObjectState, mount: np.ndarray) -> OnboardState:
         """What the drone at `mount` estimates."""
-        seen, matrix = State(), pair.matrix
+        seen, matrix = OnboardState(), pair.matrix
         seen.position[:] = pair.position + matrix @ mount
         seen.velocity[:] = pair.velocity + matrix @ np.cross(pair.rates, mount)
         seen.quaternion[:], seen.rates[:] = pair.quaternion, pair.rates
         seen.variance[:], seen.time, seen.can_fly, seen.voltage = [1e-5] * 3, self.now, True, 4.0
         return seen
 
-    def tick(self, order: Phase | None, pair: ObjectState | None = None, **wrong: Any) -> list[Any]:
+    def tick(self, order: AppPhase | None, pair: ObjectState | None = None, **wrong: Any) -> list[Any]:
         """A period of both; `wrong` values of the leader's state. Returns both setpoints."""
         beats = [app.send() for app in self.apps]
         self.now += self.apps[0].period
@@ -111,14 +111,14 @@ class Bench:
 
     def take_off(self) -> None:
         """To the first period under the laws, which the laptop asks for: this pair does not leave the ground."""
-        for phase, periods in ((Phase.IDLE, 3), (Phase.SPIN, 5), (Phase.RAMP, 150), (Phase.FLY, 5)):
+        for phase, periods in ((AppPhase.IDLE, 3), (AppPhase.SPIN, 5), (AppPhase.RAMP, 150), (AppPhase.FLY, 5)):
             for _ in range(periods):
                 self.tick(phase)
-                if self.apps[0].phase is Phase.FLY:
+                if self.apps[0].phase is AppPhase.FLY:
                     return
 
     @property
-    def phases(self) -> list[Phase]:
+    def phases(self) -> list[AppPhase]:
         return [app.phase for app in self.apps]
 
     def cause(self, number: int = 0) -> str:

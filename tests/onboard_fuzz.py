@@ -19,7 +19,7 @@ from onboard_bench import policy_of
 from mjxball.export import in_team
 from mjxball.policy.file import load_file, shipped_policy
 from mjxfly.app.generate import CORE, EXACT, files_of
-from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app.protocol import CAUSES, AppPhase
 
 DRIVER = Path(__file__).with_suffix(".c")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
@@ -52,7 +52,7 @@ def fuzz(files: Mapping[str, str], role: int, ticks: int, seed: int) -> dict[str
             "report": next((line for line in lines if "rror" in line), lines[-1] if lines else str(done.returncode))
         }
     found = json.loads(done.stdout)
-    found["phases"] = dict(zip((phase.name.lower() for phase in Phase), found["phases"], strict=True))
+    found["phases"] = dict(zip((phase.name.lower() for phase in AppPhase), found["phases"], strict=True))
     for kind in ("causes", "refusals"):
         found[kind] = {text: count for text, count in zip(CAUSES, found[kind], strict=True) if count}
     return found

@@ -10,7 +10,7 @@ import sys
 import pytest
 from command_line import REPOSITORY
 
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import POSITIONING
 
 DOCS = REPOSITORY / "docs"
@@ -20,7 +20,7 @@ import flight_tables  # noqa: E402
 
 
 def test_every_state_is_explained() -> None:
-    assert [state.value for state in State if f"| {state.value} | " not in SUPERVISOR] == []
+    assert [state.value for state in FlightState if f"| {state.value} | " not in SUPERVISOR] == []
 
 
 def test_positioning_is_that_which_was_measured() -> None:

@@ -23,7 +23,7 @@ from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.view.page import flight_page, page_contents
 from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.physics import make_pair
 from mjxfly.view.live import LiveView, Server
 from mjxfly.view.live_log import LiveLog
@@ -75,7 +75,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Journal(path, **log_header(contents, TEXT)) as notes:
         settings = FlightSettings(seconds=1.0, goal=(0.1, 0.0, 0.4))
         world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.card), log=notes)
-        world.fly_until(State.DONE)
+        world.fly_until(FlightState.DONE)
         notes.note("refused", text=TEXT)
     return path
 

@@ -11,7 +11,7 @@ import pytest
 
 from mjxball import config as configs
 from mjxball.env import TransportEnv
-from mjxball.scalar_form import LARGEST, scalar_form
+from mjxball.scalar_form import MAX_ITEMS, scalar_form
 
 
 def rotation(x: Any) -> Any:
@@ -26,15 +26,15 @@ def rotation(x: Any) -> Any:
 
 
 def large(x: Any) -> Any:
-    """What is larger than `LARGEST` and what is unknown to the scalar form, between small arrays."""
-    wide = jnp.outer(x, jnp.arange(LARGEST, dtype=x.dtype)).cumsum(axis=1)
+    """What is larger than `MAX_ITEMS` and what is unknown to the scalar form, between small arrays."""
+    wide = jnp.outer(x, jnp.arange(MAX_ITEMS, dtype=x.dtype)).cumsum(axis=1)
     return jnp.sort(wide[:, -1]) + jax.random.normal(jax.random.PRNGKey(0), x.shape)
 
 
 @jax.jit
 def wide_call(x: Any) -> Any:
     """A call with small and large arrays in it."""
-    return jnp.outer(x + 1.0, jnp.arange(LARGEST, dtype=x.dtype)).sum(axis=1) + jnp.sin(x)
+    return jnp.outer(x + 1.0, jnp.arange(MAX_ITEMS, dtype=x.dtype)).sum(axis=1) + jnp.sin(x)
 
 
 def calling(x: Any) -> Any:

@@ -83,11 +83,11 @@ TRAINING = """
 import jax
 from conftest import with_settings
 from mjxball import config
-from mjxball.train.program import Program, train
+from mjxball.train.program import TrainingProgram, train
 for preset, physics in (("balance", "mjx"), ("flight", "newton-euler"), ("paper", "newton-euler")):
     small = {"num_envs": 8, "batch_size": 8, "replay_size": 8000}
     settings = with_settings(config.preset(preset), sac=small, follower={"recurrent_units": 0})
-    program = Program(settings, physics)
+    program = TrainingProgram(settings, physics)
     state = jax.eval_shape(program.create, jax.random.key(0))
     jax.eval_shape(program.advance, state, train(1))
 """

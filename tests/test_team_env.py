@@ -28,7 +28,7 @@ from mjxball.plant.trim import largest_amplitude, safe_radius
 from mjxball.sim.randomization import ResetDistribution
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
-from mjxball.train.program import Agents, Environments, Program
+from mjxball.train.program import Agents, Environments, TrainingProgram
 
 PAPER = preset("paper")
 SIZES = (2, 3, 4, 6)
@@ -319,7 +319,7 @@ def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
     changes = {f"{algorithm}.{name}": value for name, value in (sizes | own).items()}
     config = configs.apply_overrides(ring_config(settings(), 3), {"scenario.team_sizes": (2, 3)} | changes)
     kind = find(ALGORITHMS[algorithm], "--algorithm")
-    program = Program(config, "newton-euler", extensions=Extensions(algorithm=kind))
+    program = TrainingProgram(config, "newton-euler", extensions=Extensions(algorithm=kind))
     state = jax.jit(program.create)(jax.random.PRNGKey(0))
     before = program.policy(state).layers
     advance = jax.jit(program.advance)

@@ -20,7 +20,7 @@ from mjxfly.main import make_parser
 from mjxfly.mocap_supervision import MocapLimits
 from mjxfly.packets import THRUST_CEILING, THRUST_FLOOR
 from mjxfly.setpoints import CommandMap
-from mjxfly.supervisor import TRANSITIONS, Event, State
+from mjxfly.supervisor import TRANSITIONS, Event, FlightState
 from mjxfly.twin.conditions import FAULT_KINDS, Conditions
 from mjxfly.twin.drone import ACTED
 
@@ -50,9 +50,9 @@ def log_sources() -> str:
 
 def transitions() -> str:
     """The supervisor's transitions, an event a line and a state a column; an empty cell keeps the state."""
-    states = [state for state in State if state is not State.DONE]
+    states = [state for state in FlightState if state is not FlightState.DONE]
     lines = ["| event | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
-    cells = {key: state.value for key, state in TRANSITIONS.items()} | {(State.HOLD, Event.RESUMED): "as before"}
+    cells = {key: state.value for key, state in TRANSITIONS.items()} | {(FlightState.HOLD, Event.RESUMED): "as before"}
     for event in Event:
         lines.append(f"| {event.value} | " + " | ".join(cells.get((state, event), "") for state in states) + " |")
     return "\n".join(lines)

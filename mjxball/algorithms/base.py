@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
-class Phase(NamedTuple):
+class TrainingPhase(NamedTuple):
     """Purpose of a block of environment steps. The fields are traced, so one compiled program serves all phases."""
 
     random: Bool[Array | np.ndarray, ""]  # act uniformly at random and record, before learning starts
@@ -176,12 +176,12 @@ class Algorithm(Protocol):
         """Initial state: any pytree of arrays, none of them empty."""
         ...
 
-    def collect(self, state: Any, envs: Any, keys: Any, phase: Phase) -> tuple[Any, Any]:
+    def collect(self, state: Any, envs: Any, keys: Any, phase: TrainingPhase) -> tuple[Any, Any]:
         """Step the environments and store in the state what `update` learns from: (state, envs)."""
         ...
 
     def update(
-        self, state: Any, keys: Any, progress: Float[Array, ""], phase: Phase
+        self, state: Any, keys: Any, progress: Float[Array, ""], phase: TrainingPhase
     ) -> tuple[Any, dict[str, Float[Array, ""]]]:
         """Learn if `phase.learning`: (state, values of `metrics`). `progress` is the share of training done, 0 to 1.
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
+from mjxball.algorithms.base import Environments, PolicyNetwork, Schedule, TrainingPhase
 from mjxball.algorithms.recurrent import fresh_layers
 from mjxball.arrays import Array
 from mjxball.config import Config
@@ -132,7 +132,7 @@ class FirstOrderGradient:
         means[:seen], squares[:seen] = mean, mean**2 + deviation**2
         return state._replace(layers=layers, mean=means, square=squares, seen=np.ones((), np.float32))
 
-    def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
+    def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: TrainingPhase) -> tuple[Any, Any]:
         """One window of all environments and its gradient. The first window gives the observations' statistics."""
         environments = self._environments
         begins = starts_anew(environments.turn, state.windows, self._config.windows_per_episode)
@@ -232,7 +232,7 @@ class FirstOrderGradient:
         return damped.replace(obs=jnp.concatenate(parts, axis=-1))
 
     def update(
-        self, state: GradientState, keys: Sequence[Array], progress: Array, phase: Phase
+        self, state: GradientState, keys: Sequence[Array], progress: Array, phase: TrainingPhase
     ) -> tuple[GradientState, dict[str, Array]]:
         """One step of Adam along the window's gradient. The learning rate decays by a cosine."""
         settings = self._config

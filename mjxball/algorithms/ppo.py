@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, Transition
+from mjxball.algorithms.base import Environments, PolicyNetwork, Schedule, TrainingPhase, Transition
 from mjxball.algorithms.networks import normaliser
 from mjxball.algorithms.recurrent import RecurrentPolicy, answer
 from mjxball.config import Config, Ppo
@@ -83,7 +83,7 @@ class ProximalPolicyOptimization:
         rollout = _rollout(transition, policy_output, action, scalar)
         return PpoState(parameters, ADAM.init(parameters), brax.running_statistics.init_state(specification), rollout)
 
-    def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[PpoState, Any]:
+    def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: TrainingPhase) -> tuple[PpoState, Any]:
         """`steps_per_collect` steps of all environments, whose observations update the normaliser."""
         act_keys, fresh = jax.random.split(keys[0], self.steps_per_collect), self._environments.drawn(envs, keys[1])
         distribution = self.networks.parametric_action_distribution
@@ -106,7 +106,7 @@ class ProximalPolicyOptimization:
         return jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), updated, state), envs
 
     def update(
-        self, state: PpoState, keys: Sequence[Array], progress: Array, phase: Phase
+        self, state: PpoState, keys: Sequence[Array], progress: Array, phase: TrainingPhase
     ) -> tuple[PpoState, dict[str, Array]]:
         """`EPOCHS` passes over the rollout in `minibatches` parts. The steps of an unroll stay together."""
         ppo, count = self._config, self._environments.count

@@ -13,7 +13,7 @@ import optax
 from jax import Array
 
 from mjxball.algorithms import replay
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
+from mjxball.algorithms.base import Environments, PolicyNetwork, Schedule, TrainingPhase
 from mjxball.algorithms.networks import Networks, make_networks
 from mjxball.algorithms.recurrent import answer
 from mjxball.algorithms.replay import Replay, Transitions
@@ -257,7 +257,7 @@ class SoftActorCritic:
             replay.create(capacity, self._environments.count, *self._sizes),
         )
 
-    def collect(self, state: SacState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[SacState, Any]:
+    def collect(self, state: SacState, envs: Any, keys: Sequence[Array], phase: TrainingPhase) -> tuple[SacState, Any]:
         """One step of all environments, which enters the replay and the normaliser."""
         learner, (*act_keys, reset_key) = state.learner, keys
         action, memory = self._act(learner, envs.states.obs, act_keys, phase)
@@ -278,7 +278,7 @@ class SoftActorCritic:
         return SacState(learner._replace(normaliser=normaliser), buffer), envs
 
     def _act(
-        self, learner: Learner, observation: Float[Array, "envs n"], keys: Sequence[Array], phase: Phase
+        self, learner: Learner, observation: Float[Array, "envs n"], keys: Sequence[Array], phase: TrainingPhase
     ) -> tuple[Float[Array, "envs actions"], Float[Array, "envs units"]]:
         """(actions, next states of a recurrent policy)."""
         sample_key, random_key = map(self._shards.own, keys)
@@ -292,7 +292,7 @@ class SoftActorCritic:
         return jnp.where(phase.evaluate, distribution.mode(parameters), chosen), memory
 
     def update(
-        self, state: SacState, keys: Sequence[Array], progress: Float[Array, ""], phase: Phase
+        self, state: SacState, keys: Sequence[Array], progress: Float[Array, ""], phase: TrainingPhase
     ) -> tuple[SacState, dict[str, Float[Array, ""]]]:
         """`updates_per_step` gradient steps, each on a batch from the replay."""
         rate = 1.0 + (self._config.learning_rate_final_ratio - 1.0) * progress

@@ -34,7 +34,7 @@ import numpy as np
 from mjxball.arrays import Array, clipped, joined
 from mjxball.baselines.linear import times
 from mjxball.baselines.motion import LIFT, PITCH, PITCH_RATE, ROLL, ROLL_RATE
-from mjxball.baselines.mpc_design import MEASURED, NAME, PAIR, TEAM, Design, Limits, design, limits_of
+from mjxball.baselines.mpc_design import MEASURED, NAME, PAIR, TEAM, Limits, MpcDesign, design, limits_of
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
@@ -51,10 +51,10 @@ RHO, ITERATIONS, TOLERANCE = 3.0, 400, 1e-3
 AXES = ((0, ROLL, ROLL_RATE), (1, PITCH, PITCH_RATE))
 
 
-class Program:
+class QuadraticProgram:
     """The quadratic program for an object of `mass` [kg], in corrections times the square root of their cost."""
 
-    def __init__(self, own: Design, limits: Limits, mass: float):
+    def __init__(self, own: MpcDesign, limits: Limits, mass: float):
         from scipy import sparse
 
         carried = limits.own_mass + limits.load_share * mass
@@ -104,7 +104,7 @@ class Program:
         return first, known
 
 
-def limit_rows(own: Design, limits: Limits, carried: float) -> tuple[np.ndarray, ...]:
+def limit_rows(own: MpcDesign, limits: Limits, carried: float) -> tuple[np.ndarray, ...]:
     """Rows of the state (m, n), of the corrections (m, k), bounds low and high (m,), and rows of the hover force (m,).
 
     In this order at every step in `CHECKED`: command (3), rotor forces (4), roll, pitch and lift (3).
@@ -148,11 +148,11 @@ class Mpc:
         self._gravity, self._angles, self._others = plant.gravity, mount_angles(plant), plant.count - 1
         tuning = self.team_tuning if plant.is_team else self.tuning
         self.designs = [design(config, tuning, mass) for mass in MASSES]
-        self._stacked = Design(*(np.stack(parts) for parts in zip(*self.designs, strict=True)))
+        self._stacked = MpcDesign(*(np.stack(parts) for parts in zip(*self.designs, strict=True)))
         self._mounts = np.array([drone.mount for drone in plant.drones])[[*plant.followers], :2]  # from O [m]
         if self._others == 1:
             self._mounts = self._mounts[0]
-        self._programs: dict[int, Program] = {}
+        self._programs: dict[int, QuadraticProgram] = {}
         self._states = self._stacked.drive.shape[-2]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class Mpc:
         xp, dtype, mass = observation.__array_namespace__(), observation.dtype, privileged.believed_mass
         observation = self._seen(observation)
         kind = xp.round(clipped(mass, 0.0, MASSES[-1]) / MASSES[1]).astype(int)
-        own = Design(*(xp.asarray(part, dtype=dtype)[kind] for part in self._stacked))
+        own = MpcDesign(*(xp.asarray(part, dtype=dtype)[kind] for part in self._stacked))
         hover = (self._limits.own_mass + self._limits.load_share * mass) * self._gravity / 4.0
         x, commands = self._estimate(own, state, observation), state[..., self._states :]
         now = x
@@ -191,7 +191,7 @@ class Mpc:
         moved = self._moved(own, x, commands[..., :3], hover)
         return xp.concat([moved, commands[..., 3:]], axis=-1), self._sent(command)
 
-    def _estimate(self, own: Design, state: Array, observation: Array) -> Array:
+    def _estimate(self, own: MpcDesign, state: Array, observation: Array) -> Array:
         """The filter's state (..., n) corrected by `observation`, at the time of its measurements."""
         left = joined(self._measured(observation)) - joined([state[..., place] for place in MEASURED])
         return state[..., : self._states] + times(own.gain, left)
@@ -216,7 +216,7 @@ class Mpc:
         z = 0.5 * (rate[..., 2] - own[..., 2] + left * p - ahead * q)
         return [error[..., 0], x, pitch, q, error[..., 1], y, roll, p, error[..., 2], z]
 
-    def _moved(self, own: Design, x: Array, command: Array, hover: Array) -> Array:
+    def _moved(self, own: MpcDesign, x: Array, command: Array, hover: Array) -> Array:
         """State (..., n) one period after `x` with the follower's `command` (..., 3) and saturating rotors."""
         led, lost = times(own.led, x), 0.0
         for drones, sent in ((1.0, led), (self._others, command)):
@@ -235,7 +235,7 @@ class Mpc:
         left = lift.__array_namespace__().minimum(lift, self._limits.rotor_force - lift)
         return self._limits.torque_per_force * clipped(left, 0.0, self._limits.rotor_force)
 
-    def _command(self, own: Design, x: Array, hover: Array, kind: Array) -> Array:
+    def _command(self, own: MpcDesign, x: Array, hover: Array, kind: Array) -> Array:
         """Command (..., 3) at state `x` (..., n). The vertical part is clipped first, because it uses rotor force."""
         xp, (tilt_limit, vertical_limit) = x.__array_namespace__(), self._leader[-2:]
         desired, far = times(own.feedback, x), times(own.far, x)
@@ -262,7 +262,7 @@ class Mpc:
         states, first, known = x.reshape(-1, self._states).astype(float), np.zeros((kind.size, 3)), kind >= 0
         for one in np.unique(kind).tolist():
             if one not in self._programs:
-                self._programs[one] = Program(self.designs[one], self._limits, MASSES[one])
+                self._programs[one] = QuadraticProgram(self.designs[one], self._limits, MASSES[one])
             chosen = kind == one
             found = self._programs[one].corrections(states[chosen], hover[chosen].astype(float))
             first[chosen], known[chosen] = found

@@ -79,7 +79,7 @@ TEAM = Tuning(
 )
 
 
-class Design(NamedTuple):
+class MpcDesign(NamedTuple):
     """The controller for one mass of the object: x <- A x + B u of the followers' command u, with the leader in A."""
 
     transition: Float[Array, "n n"]  # A of the filter; n = 16, of a team 18
@@ -119,7 +119,7 @@ def known_model(config: Config) -> AssemblyModel:
     return model
 
 
-def design(config: Config, tuning: Tuning, mass: float) -> Design:
+def design(config: Config, tuning: Tuning, mass: float) -> MpcDesign:
     """The controller for the plant of `config` with an object of `mass` [kg]; InputError as from `known_model`."""
     nominal = known_model(config)
     model, levers = _with_object(config, nominal, mass), _levers(nominal, mass)
@@ -140,7 +140,7 @@ def design(config: Config, tuning: Tuning, mass: float) -> Design:
         far[row, states] = mean[row, states]
     feedback, correction = _followers_command(model, _about_target(model, mean, 1.0 / memory), led, levers)
     walks = {state: walk for state, walk in tuning.walks(scale).items() if state < size}
-    return Design(
+    return MpcDesign(
         transition=transition,
         forecast=(planned + of_leader @ led)[:size, :size],
         drive=of_followers[:size],
@@ -199,7 +199,7 @@ def _about_target(model: AssemblyModel, mean: np.ndarray, forgets: float) -> np.
 def _followers_command(
     model: AssemblyModel, mean: np.ndarray, led: np.ndarray, levers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(F (3, 18), E (3, 3)) of `Design`: the followers' command for the gains `mean` and the leader's `led`."""
+    """(F (3, 18), E (3, 3)) of `MpcDesign`: the followers' command for the gains `mean` and the leader's `led`."""
     count, others = len(model.own_mass), model.followers
     feedback, correction = (count * mean - led) / others, count / others * np.eye(3)
     for axis in (0, 1):  # minus the torque of unequal lifts

@@ -23,7 +23,7 @@ from mjxball.train import shares
 from mjxball.train.lock import LOCK, check_free
 from mjxball.train.run_directory import (
     EXTENSIONS,
-    LARGEST_SEED,
+    MAX_SEED,
     MOST_MEMBERS,
     commit,
     differences,
@@ -46,8 +46,8 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     name, seed = options.preset or plant_preset or "transport", options.seed or 0
     _refuse_settings_of_others(options)
     settings = cli.apply_config_flags(config.preset(name), options)
-    if not 0 <= seed <= LARGEST_SEED:
-        raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
+    if not 0 <= seed <= MAX_SEED:
+        raise InputError(f"--seed must be between 0 and {MAX_SEED}, not {seed}")
     stem = options.env.rpartition(":")[2] if options.env else name
     out = output_directory(options.out or Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)

@@ -13,7 +13,7 @@ from mjxball.config._plausible import check_units
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
 from mjxball.errors import InputError
-from mjxball.reading import SMALLEST, is_number, shown
+from mjxball.reading import MIN_SIZE, is_number, shown
 
 MOST_DRONES = 16  # of a plant
 FARTHEST = 10.0  # distance of a mount from O [m]
@@ -59,7 +59,7 @@ def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
     if not bounds["low"] <= number <= bounds["high"]:
         raise InputError(f"{path} must be between {bounds['low']:g} and {bounds['high']:g}, not {shown(number)}")
     if not is_number(number):
-        raise InputError(f"{path} must be 0 or at least {SMALLEST:g} in size, not {shown(number)}")
+        raise InputError(f"{path} must be 0 or at least {MIN_SIZE:g} in size, not {shown(number)}")
 
 
 def validate(config: Config) -> Config:

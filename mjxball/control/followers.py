@@ -12,7 +12,8 @@ from mjxball.config import Config
 from mjxball.control.observation import OBSERVATION, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
 
-LARGEST = 1e6  # bound of an observation's sum of absolute values: far beyond any flight, fine for float32 filters
+# Sum of the absolute numbers of an observation: no flight comes near it, and float32 can filter it.
+MAX_OBSERVATION = 1e6
 
 
 class PrivilegedInfo(NamedTuple):
@@ -64,7 +65,7 @@ class Follower(Protocol):
 def checked_observation(observation: Array) -> np.ndarray:
     """`observation` (..., 18) as float64. Raises InputError that names the bad component if it is invalid.
 
-    Valid are finite real values with an absolute sum below `LARGEST`. A follower that filters observations would
+    Valid are finite real values with an absolute sum below `MAX_OBSERVATION`. A follower that filters observations would
     otherwise carry one bad value for the rest of the flight.
     """
     given = real_numbers(observation, "an observation")
@@ -72,9 +73,9 @@ def checked_observation(observation: Array) -> np.ndarray:
         raise InputError(f"observation must have {OBSERVATION_SIZE} numbers last, not shape {given.shape}")
     values = given.astype(np.float64)
     if given.ndim == 1:
-        valid = sum(map(abs, values.tolist())) < LARGEST  # for so few values three times as fast as NumPy
+        valid = sum(map(abs, values.tolist())) < MAX_OBSERVATION  # for so few values three times as fast as NumPy
     else:
-        valid = bool((np.abs(values).sum(axis=-1) < LARGEST).all())
+        valid = bool((np.abs(values).sum(axis=-1) < MAX_OBSERVATION).all())
     if not valid:
         size = np.where(np.isnan(values), np.inf, np.abs(values))
         value, (name, unit) = values.flat[int(size.argmax())], OBSERVATION[int(size.argmax()) % OBSERVATION_SIZE]

@@ -119,7 +119,7 @@ class Requirements:
 REQUIREMENTS = Requirements()
 
 
-class Design(NamedTuple):
+class AxisDesign(NamedTuple):
     """Gains of one axis and their margins."""
 
     axis: Axis
@@ -128,12 +128,12 @@ class Design(NamedTuple):
     worst: Margins  # the smallest of each margin over the corners
 
 
-def design(config: Config) -> tuple[Design, ...]:
+def design(config: Config) -> tuple[AxisDesign, ...]:
     """Gains for roll, pitch and yaw of the pair in `config`. Raises ValueError if nothing keeps the margins."""
     return tuple(design_axis(axis, config) for axis in axes(config))
 
 
-def design_axis(axis: Axis, config: Config) -> Design:
+def design_axis(axis: Axis, config: Config) -> AxisDesign:
     """The stiffest of a grid of gains: rate kp, its kd as a lead, attitude kp.
 
     Only the rate integral holds constant moments; it is sized for `Axis.trim`. Both drones turn one body, so the
@@ -141,7 +141,7 @@ def design_axis(axis: Axis, config: Config) -> Design:
     An axis with about the inertia of two single drones keeps the delivered gains, which many have flown.
     """
     if axis.inertia_ratio < REQUIREMENTS.keep_below:
-        return Design(
+        return AxisDesign(
             axis,
             delivered_gains(axis),
             *nominal_and_worst(delivered_gains(axis), axis, config.plant.rotor_lag),
@@ -157,7 +157,7 @@ def design_axis(axis: Axis, config: Config) -> Design:
             continue
         nominal, worst = nominal_and_worst(gains, axis, lag)
         if worst.phase >= REQUIREMENTS.worst_phase and min(worst.gain_up, worst.gain_down) >= REQUIREMENTS.worst_gain:
-            return Design(axis, gains, nominal, worst)
+            return AxisDesign(axis, gains, nominal, worst)
     raise ValueError(f"no gains keep the margins about {axis.name}")
 
 
@@ -200,7 +200,7 @@ def gains_of(autopilot: Autopilot, axis: Axis) -> Gains:
     return Gains(getattr(autopilot, axis.name), getattr(autopilot, f"{axis.name}_rate"))
 
 
-def apply(autopilot: Autopilot, designs: tuple[Design, ...]) -> Autopilot:
+def apply(autopilot: Autopilot, designs: tuple[AxisDesign, ...]) -> Autopilot:
     """`autopilot` with the gains of `designs`."""
     roll, pitch, yaw = (one.gains for one in designs)
     autopilot = replace(autopilot, roll=roll.attitude, pitch=pitch.attitude, yaw=yaw.attitude)

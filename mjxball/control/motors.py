@@ -22,7 +22,7 @@ FULL = crazyflie.FULL  # PWM of full power, and thrust command of full thrust
 USUAL_BATTERY = 3.7  # [V] in hover, used if no voltage is sampled or measured
 Curve = tuple[float, float]  # force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]
 OLDER: Curve = (0.0915, 0.0677)  # a 2.1's firmware without battery compensation
-LARGEST_HOVER = 60000.0  # of the paper's thrust map, the firmware's cap
+MAX_HOVER = 60000.0  # of the paper's thrust map, the firmware's cap
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def with_curve(config: Config, curve: Curve) -> Config:
     level = float(crazyflie.motor_command(curve, np.float64(force)))
     scaled = dataclasses.replace(
         changed.autopilot,
-        hover_thrust=min(level, LARGEST_HOVER),
+        hover_thrust=min(level, MAX_HOVER),
         thrust_per_acceleration=autopilot.thrust_per_acceleration
         * slope(autopilot.motor_curve, autopilot.hover_thrust)
         / slope(curve, level),

@@ -61,7 +61,7 @@ def check_process() -> None:
         )
 
 
-class Program(NamedTuple):
+class CompiledEnv(NamedTuple):
     """Functions of one world or of N at once, each compiled at its first call. A chain is a key split at each reset."""
 
     env: TransportEnv
@@ -75,7 +75,7 @@ class Program(NamedTuple):
 
 
 @functools.lru_cache(maxsize=16)
-def program(config: Config, physics: str, many: bool = False) -> Program:
+def program(config: Config, physics: str, many: bool = False) -> CompiledEnv:
     """The program of `config` on `physics`, compiled once for all environments of a process."""
     check_process()
     enable_compilation_cache()
@@ -97,7 +97,7 @@ def program(config: Config, physics: str, many: bool = False) -> Program:
         return chain, moved, fresh
 
     parts = jax.random.key, start, env.step, env.commands, arrive, next_step, same_step
-    return Program(env, *(jax.jit(jax.vmap(part) if many else part) for part in parts))
+    return CompiledEnv(env, *(jax.jit(jax.vmap(part) if many else part) for part in parts))
 
 
 def _where(ended: Array, fresh: Any, running: Any) -> Any:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-class Commands(NamedTuple):
+class CommandLimits(NamedTuple):
     """Gains and command limits of drones with ideal attitude loops."""
 
     gains: tuple[float, float]  # of each drone's loop about roll and pitch [N m/rad]
@@ -27,7 +27,7 @@ class Commands(NamedTuple):
     vertical: float  # largest acceleration up or down [m/s2]
 
 
-def commanded(plant: Plant | Config) -> tuple[Plant, Commands | None]:
+def commanded(plant: Plant | Config) -> tuple[Plant, CommandLimits | None]:
     """The plant, and its command limits; None where commands can produce any rotor force, and for a `Plant` alone."""
     if isinstance(plant, Plant):
         return plant, None
@@ -35,11 +35,11 @@ def commanded(plant: Plant | Config) -> tuple[Plant, Commands | None]:
     if config.autopilot.kind != "ideal":
         return config.plant, None
     roll, pitch, _ = map(float, plant_parameters(config.plant, config.attitude).gains.kp)
-    return config.plant, Commands((roll, pitch), config.command.tilt_limit, config.command.vertical_limit)
+    return config.plant, CommandLimits((roll, pitch), config.command.tilt_limit, config.command.vertical_limit)
 
 
 def asked_rows(
-    plant: Plant, commands: Commands | None, drones: np.ndarray, factor: np.ndarray, believes: np.ndarray
+    plant: Plant, commands: CommandLimits | None, drones: np.ndarray, factor: np.ndarray, believes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (yaw torques (A, 4 N), commands (3 A, 4 N), commands at hover (3 A,)) of the A drones numbered `drones`.
 

@@ -27,7 +27,7 @@ import numpy as np
 from mjxball.arrays import Array
 from mjxball.config import Config, Plant, thrust_over_weight, total_mass
 from mjxball.errors import InputError
-from mjxball.plant.commands import Commands, asked_rows, commanded, effect_of
+from mjxball.plant.commands import CommandLimits, asked_rows, commanded, effect_of
 from mjxball.plant.parameters import PlantParameters
 
 TINY, LEAST_SCATTER = 1e-9, 1e-3  # [N], [m2] below which drones sit in one place
@@ -241,7 +241,7 @@ def _hover(
     lost: Collection[int],
     leader_helps: bool,
     thrust: Sequence[float] | None,
-    commands: Commands | None,
+    commands: CommandLimits | None,
 ) -> _Hover | None:
     """The hover equations, or None if the rotors that act cannot lift the assembly or have nothing to lift."""
     count, gravity = plant.count, plant.gravity

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     FollowerCommand = Float[Array, "... 3"]  # of several followers (..., F, 3)
 
 
-class Commands(NamedTuple):
+class TeamCommands(NamedTuple):
     """Commands of all drones: roll, pitch [rad], vertical acceleration [m/s2], in body axes."""
 
     leader: Vector
@@ -76,7 +76,7 @@ class ClosedLoop(Laws):
         sample: Sample,
         on_pid: Scalar | float = 1.0,
         physics: ControlStep | None = None,
-    ) -> tuple[LoopState, Observation, Commands]:
+    ) -> tuple[LoopState, Observation, TeamCommands]:
         """One control period: (state, observation at its end, commands).
 
         `follower` is the followers' answer to `observation`, in their mount frames. `goals` are those of O at the
@@ -102,19 +102,19 @@ class ClosedLoop(Laws):
         follower: FollowerCommand,
         goal: Vector,
         on_pid: Scalar | float = 1.0,
-    ) -> Commands:
+    ) -> TeamCommands:
         """All commands at `observation`; arguments as for `step`."""
         return self._commands(self._leader_body(state, observation, goal), state.integral, follower, goal, on_pid)
 
     def _commands(
         self, measured: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
-    ) -> Commands:
+    ) -> TeamCommands:
         leader_command = self.leader_command(measured, goal, integral)
         follower = self.in_body_axes(follower)
         if not self._on_pid:
-            return Commands(leader_command, follower)
+            return TeamCommands(leader_command, follower)
         xp, on_pid = leader_command.__array_namespace__(), np.asarray(on_pid)
-        return Commands(
+        return TeamCommands(
             leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, integral), follower)
         )
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import PlantState, Scalar, Vector
-    from mjxball.sim.closed_loop import Commands
+    from mjxball.sim.closed_loop import TeamCommands
 
 NOT_RECORDED: Any = None
 
@@ -48,7 +48,7 @@ class Trajectory(NamedTuple):
     contact_torque: Float[Array, "T ... drones 3"] = NOT_RECORDED  # likewise, about each drone's centre [N m]
 
     @classmethod
-    def of(cls, plant: PlantState, time: Scalar, target: Vector, commands: Commands, **others: Any) -> Trajectory:
+    def of(cls, plant: PlantState, time: Scalar, target: Vector, commands: TeamCommands, **others: Any) -> Trajectory:
         """The record of `plant`, any leading axes, at `time` with `target`, `commands` and `others` by name."""
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         motion = plant.position, plant.velocity, euler, plant.rates, plant.quaternion, plant.rotor_force

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjxball.algorithms.base import Phase, PolicyNetwork
+from mjxball.algorithms.base import PolicyNetwork, TrainingPhase
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.terminal import warn
@@ -18,7 +18,7 @@ from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
 from mjxball.train.live import LiveCurve, Report, in_notebook
 from mjxball.train.loop import Plan
-from mjxball.train.program import Mode, Program, TrainState
+from mjxball.train.program import Mode, TrainingProgram, TrainState
 
 
 def train(
@@ -71,7 +71,7 @@ def _train(
     evaluate: bool,
     report: Report | None,
 ) -> tuple[PolicyNetwork, dict[str, Array]]:
-    program = Program(config, physics, overrides, extensions=extensions)
+    program = TrainingProgram(config, physics, overrides, extensions=extensions)
     program.algorithm.check_parts(1)
     state = program.create(key)
     fresh = program.evaluation_envs(jax.random.PRNGKey(0)) if evaluate else state.envs
@@ -102,7 +102,9 @@ def _train(
     return program.policy(state), metrics
 
 
-def _in_turns(phase: Any, state: TrainState, modes: Mode, program: Program, report: Report) -> tuple[TrainState, Any]:
+def _in_turns(
+    phase: Any, state: TrainState, modes: Mode, program: TrainingProgram, report: Report
+) -> tuple[TrainState, Any]:
     """`jax.lax.scan` of `phase` as a loop in Python, with a `report` after each chunk of training (`loop.Plan`).
 
     Ctrl-C returns the state and the metrics so far; before the first phase has ended it is raised.
@@ -131,7 +133,7 @@ def _in_turns(phase: Any, state: TrainState, modes: Mode, program: Program, repo
     return state, jax.tree.map(lambda *values: jnp.stack(values), *seen)
 
 
-def _phases(program: Program, evaluate: bool) -> Mode:
+def _phases(program: TrainingProgram, evaluate: bool) -> Mode:
     """Stacked modes of a whole training: the warm-up, then training and evaluation alternating, or training alone."""
     first, total = program.warmup_rounds, max(program.total_rounds, program.warmup_rounds)
     window = program.algorithm.steps_per_collect
@@ -142,5 +144,5 @@ def _phases(program: Program, evaluate: bool) -> Mode:
         modes += [programs.train(int(steps)), programs.evaluate(program.evaluation_steps)][: 1 + evaluate]
     return Mode(
         np.stack([mode.steps for mode in modes]),
-        Phase(*(np.stack(list(flags)) for flags in zip(*(mode.phase for mode in modes), strict=True))),
+        TrainingPhase(*(np.stack(list(flags)) for flags in zip(*(mode.phase for mode in modes), strict=True))),
     )

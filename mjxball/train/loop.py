@@ -11,7 +11,7 @@ import jax
 
 from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.program import Program
+from mjxball.train.program import TrainingProgram
 from mjxball.train.run import Chunk, Run, Stop, graceful_interrupt
 
 CHUNKS = 25  # rows of metrics.csv in a run, at most
@@ -72,7 +72,7 @@ class Plan(NamedTuple):
     evaluations: int  # number of evaluations
 
     @classmethod
-    def of(cls, program: Program) -> Plan:
+    def of(cls, program: TrainingProgram) -> Plan:
         """The plan of a program's schedule."""
         total, window = program.total_rounds, program.algorithm.steps_per_collect
         chunk = math.ceil(total / CHUNKS / window) * window

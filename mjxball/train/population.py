@@ -15,13 +15,13 @@ from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mjxball import config as configs
-from mjxball.algorithms.base import Phase, PolicyNetwork, Shards
+from mjxball.algorithms.base import PolicyNetwork, Shards, TrainingPhase
 from mjxball.config import Config
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
 from mjxball.train.compilation import Carrying, TracedProgram, compiler_options, jax_setting, partitioned_by_gspmd
 from mjxball.train.extensions import DEFAULTS, Extensions
-from mjxball.train.program import Program, Statistics, TrainState, report, train, warmup
+from mjxball.train.program import Statistics, TrainingProgram, TrainState, report, train, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
@@ -40,17 +40,17 @@ class Carried:
 
 
 class Compiled(NamedTuple):
-    """`Program`'s functions for all members of a population."""
+    """`TrainingProgram`'s functions for all members of a population."""
 
-    begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `Program.begin`
-    episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
-    collect: Callable[[Carried, Phase], Array]  # -> keys for `update`
+    begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `TrainingProgram.begin`
+    episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `TrainingProgram.episodes`
+    collect: Callable[[Carried, TrainingPhase], Array]  # -> keys for `update`
     update: Callable[[Carried, Array], list[Array]]  # -> the algorithm's metrics, by name
     wait: Callable[[], Any]  # wait until all are compiled; raises errors of their compilation
 
 
 class Population:
-    """`Program` for `members` followers at once, with a leading member axis unless there is only one.
+    """`TrainingProgram` for `members` followers at once, with a leading member axis unless there is only one.
 
     Member k has seed `seed + k` and the k-th value of every swept setting. In one process, members are distributed over
     its devices if these divide their number, else all use the first device. With several processes (see `processes`),
@@ -78,7 +78,7 @@ class Population:
         self.mesh = _mesh(devices, groups, parts) if spread else None
         self.devices, self.parts = groups * parts, parts
         self._shards = Shards("envs", parts) if parts > 1 else Shards()
-        self.program = Program(config, physics, shards=self._shards, extensions=extensions)
+        self.program = TrainingProgram(config, physics, shards=self._shards, extensions=extensions)
         self.program.algorithm.check_parts(parts)
         whole: Any = PartitionSpec() if self._single else PartitionSpec("members")
         split: Any = PartitionSpec(*whole, "envs")
@@ -240,7 +240,7 @@ class Population:
         """`_as_argument` of the parts of `tree`, each with its spec."""
         return jax.tree.map(lambda spec, part: self._as_argument(part, spec), specs, tree, is_leaf=_is_spec)
 
-    def place_phase(self, phase: Phase) -> Phase:
+    def place_phase(self, phase: TrainingPhase) -> TrainingPhase:
         """A phase as `Compiled.collect` takes it."""
         return self.place(phase, PartitionSpec())
 
@@ -283,7 +283,9 @@ class Population:
         episodes = lambda program, key, training: program.episodes(key, training)  # noqa: E731
         return self._on_mesh(episodes, (self._whole, PartitionSpec()), self._split, (0, None))(values, keys, training)
 
-    def _collect(self, state: TrainState, statistics: Statistics, phase: Phase) -> tuple[TrainState, Statistics, Array]:
+    def _collect(
+        self, state: TrainState, statistics: Statistics, phase: TrainingPhase
+    ) -> tuple[TrainState, Statistics, Array]:
         collect = lambda program, *arguments: program.collect(*arguments)  # noqa: E731
         given = (self._state_spec, self._statistics_spec, PartitionSpec())
         results = (self._state_spec, self._statistics_spec, self._whole)
@@ -359,10 +361,10 @@ class Population:
 
         return jax.tree.map(placed, specs, template, is_leaf=_is_spec)
 
-    def _member_program(self, values: Mapping[str, Array]) -> Program:
+    def _member_program(self, values: Mapping[str, Array]) -> TrainingProgram:
         if not values:
             return self.program
-        return Program(self.config, self._physics, values, self._shards, self._extensions)
+        return TrainingProgram(self.config, self._physics, values, self._shards, self._extensions)
 
 
 def _when_ready(pending: Future[Callable[..., Any]]) -> Callable[..., Any]:

@@ -14,7 +14,7 @@ from jax import Array
 
 from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
-from mjxball.algorithms.base import Algorithm, Phase, PolicyNetwork, Schedule, Shards, Transition
+from mjxball.algorithms.base import Algorithm, PolicyNetwork, Schedule, Shards, TrainingPhase, Transition
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.scalar_form import scalar_form
@@ -29,7 +29,7 @@ EVALUATION_DRAW = 20_261_121  # folded into the key, so that no seed trains on t
 
 
 class Statistics(NamedTuple):
-    """Sums over the steps of one call of `Program.advance`."""
+    """Sums over the steps of one call of `TrainingProgram.advance`."""
 
     reward: Float[Array, ""]  # mean reward per step, summed over steps
     ended: Float[Array, ""]  # episodes terminated
@@ -226,10 +226,10 @@ class Environments:
 
 
 class Mode(NamedTuple):
-    """Number of steps and phase of a call of `Program.advance`. Both are traced: one executable serves all modes."""
+    """Number of steps and phase of a call of `TrainingProgram.advance`. Both are traced: one executable serves all modes."""
 
     steps: Int[Array | np.ndarray, ""]  # of each environment
-    phase: Phase
+    phase: TrainingPhase
 
 
 def warmup(steps: int) -> Mode:
@@ -249,7 +249,7 @@ def evaluate(steps: int) -> Mode:
 
 def _mode(steps: int, random: bool, evaluate: bool) -> Mode:
     # NumPy scalars, because JAX compiles a program to create each of its own.
-    return Mode(np.asarray(steps, np.int32), Phase(np.asarray(random), np.asarray(evaluate)))
+    return Mode(np.asarray(steps, np.int32), TrainingPhase(np.asarray(random), np.asarray(evaluate)))
 
 
 class TrainState(NamedTuple):
@@ -261,7 +261,7 @@ class TrainState(NamedTuple):
     steps: Int[Array, ""]  # environment steps recorded
 
 
-class Program:
+class TrainingProgram:
     """Training of one follower: `create(key)` returns a state, `advance(state, mode)` the next. Both can be vmapped.
 
     `overrides` maps config paths to values, possibly traced arrays, in which members of a population differ. With
@@ -328,7 +328,9 @@ class Program:
         rounds = -(-mode.steps // self.algorithm.steps_per_collect)
         return jax.lax.fori_loop(0, rounds, body, start)
 
-    def collect(self, state: TrainState, statistics: Statistics, phase: Phase) -> tuple[TrainState, Statistics, Array]:
+    def collect(
+        self, state: TrainState, statistics: Statistics, phase: TrainingPhase
+    ) -> tuple[TrainState, Statistics, Array]:
         """One collection of the algorithm: (state, updated `statistics`, keys for the following `update`)."""
         algorithm = self.algorithm
         # One split for all keys, because each split is several kernels to compile and launch.
@@ -341,7 +343,9 @@ class Program:
         collected = self.environments.over_shards(envs.statistics)
         return TrainState(learnt, envs.states, keys[-1], steps), joined(statistics, collected), keys
 
-    def update(self, state: TrainState, keys: Array, phase: Phase) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
+    def update(
+        self, state: TrainState, keys: Array, phase: TrainingPhase
+    ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """One update of the algorithm, with the `keys` of the preceding `collect`: (state, the algorithm's metrics)."""
         progress = jnp.minimum(state.steps / self.schedule.total_steps, 1.0)
         update_keys = list(keys[self.algorithm.collect_keys : -1])

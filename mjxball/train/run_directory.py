@@ -93,7 +93,7 @@ def _refusal(path: Path, called: str, why: object) -> InputError:
 CONFIG_FILE, METRICS, POLICY, CHECKPOINTS = "config.json", "metrics.csv", "policy.npz", "checkpoints"
 EXTENSIONS = ("env", "reward", "algorithm")  # flags that name the user's code, see `mjxball.train.extensions`
 MOST_MEMBERS = 4096
-LARGEST_SEED = 2**31 - 1
+MAX_SEED = 2**31 - 1
 ORIGIN = ("seed", "physics", "seeds", "sweep")  # required keys of config.json besides the configuration
 
 
@@ -157,7 +157,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     lost = [name for name in ORIGIN if name not in record]
     if lost:
         raise InputError(f"{path} lacks {', '.join(lost)}")
-    sound = _is_whole(record["seed"], 0, LARGEST_SEED) and _is_whole(record["seeds"], 1, MOST_MEMBERS)
+    sound = _is_whole(record["seed"], 0, MAX_SEED) and _is_whole(record["seeds"], 1, MOST_MEMBERS)
     if not sound or record["physics"] not in TRAINING_ENGINES:
         raise InputError(f"{path} has no sound seed, seeds or physics")
     if record["sweep"] is not None:

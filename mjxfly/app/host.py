@@ -12,7 +12,7 @@ from pathlib import Path
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 from mjxfly.app.generate import CORE, ROLES, files_of
-from mjxfly.app.protocol import BEAT_SIZE, REPLY_SIZE, Phase
+from mjxfly.app.protocol import BEAT_SIZE, REPLY_SIZE, AppPhase
 
 FLAGS = (
     *("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror"),
@@ -43,7 +43,7 @@ class Parameters(ctypes.Structure):
     )
 
 
-class State(ctypes.Structure):
+class OnboardState(ctypes.Structure):
     """`mjxball_state`."""
 
     _fields_ = (
@@ -137,7 +137,7 @@ class App:
         scalars = {"curve": self._set.curve, "battery": self._set.battery}
         return {**vectors, **scalars, "ident": self.ident, "role": self.role, "period": self.period}
 
-    def tick(self, state: State, now: int) -> AppSetpoint:
+    def tick(self, state: OnboardState, now: int) -> AppSetpoint:
         """Run one period; return the setpoint for the commander."""
         wanted = AppSetpoint()
         self._c.tick(
@@ -163,9 +163,9 @@ class App:
         return reply.raw[:size]
 
     @property
-    def phase(self) -> Phase:
+    def phase(self) -> AppPhase:
         """The app's phase."""
-        return Phase(self._core.raw[0])
+        return AppPhase(self._core.raw[0])
 
     @property
     def command(self) -> Sequence[float]:

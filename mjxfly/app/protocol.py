@@ -32,7 +32,7 @@ LOGGED = (
 )
 
 
-class Phase(enum.IntEnum):
+class AppPhase(enum.IntEnum):
     """`mjxball_phase`: the state of an app, or the state that the laptop requests."""
 
     IDLE = 0
@@ -81,7 +81,7 @@ def reason(cause: int) -> str:
 class AppSample(NamedTuple):
     """A log packet of an app."""
 
-    phase: Phase
+    phase: AppPhase
     cause: int
     refusal: int
     copying: bool
@@ -94,10 +94,10 @@ APP_VARIABLES = tuple((f"{GROUP}.{name}", "uint8_t") for name in ("phase", "caus
 def sample_of(values: Mapping[str, float], arrival: float) -> AppSample | None:
     """Return the sample for the log variables `values` by name; None for an unknown phase."""
     phase, cause, refusal, copying = (int(values[name]) for name, _ in APP_VARIABLES)
-    return AppSample(Phase(phase), cause, refusal, bool(copying), arrival) if phase <= max(Phase) else None
+    return AppSample(AppPhase(phase), cause, refusal, bool(copying), arrival) if phase <= max(AppPhase) else None
 
 
-def order(phase: Phase) -> Packet:
+def order(phase: AppPhase) -> Packet:
     """Return the laptop's heartbeat, which requests `phase`."""
     return Packet(PORT, CHANNEL, bytes([1, phase]))
 

@@ -12,7 +12,7 @@ from mjxball import cli, config
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.control.margins import (
     REQUIREMENTS,
-    Design,
+    AxisDesign,
     Gains,
     Margins,
     apply,
@@ -63,7 +63,7 @@ def parameter_file(autopilot: config.Autopilot) -> str:
     return json.dumps(gains_to_json(pair_gains(autopilot)), indent=1) + "\n"
 
 
-def report(designs: Sequence[Design], lag: float) -> str:
+def report(designs: Sequence[AxisDesign], lag: float) -> str:
     """Return a table: per axis the designed and the delivered gains, with nominal and worst margins; `lag` in [s]."""
     head = ("axis", "inertia", "gains", "attitude kp ki kd", "rate kp ki kd", "phase", "gain", "delay", "worst")
     rows: list[tuple[str, ...]] = [head]
@@ -89,7 +89,7 @@ def report(designs: Sequence[Design], lag: float) -> str:
     return "\n".join(lines)
 
 
-def _row(one: Design, label: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
+def _row(one: AxisDesign, label: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
     gain_texts = (" ".join(f"{value:g}" for value in row) for row in gains)
     inertia = f"{one.axis.inertia_ratio:.1f} x"
     if not nominal.phase:

@@ -24,7 +24,7 @@ FREE_FALL = 0.1  # [g] largest reading of every accelerometer axis in free fall
 TRAJECTORY_FINISHED = 0x200  # info bit of the high-level commander, which is not simulated
 
 
-class Phase(enum.Enum):
+class ArmingPhase(enum.Enum):
     """States of the supervisor."""
 
     UNKNOWN = "not initialised"
@@ -41,9 +41,9 @@ class Phase(enum.Enum):
     CRASHED = "crashed"
 
 
-CAN_FLY = (Phase.READY, Phase.FLYING, Phase.LEVEL_OUT, Phase.LANDED)
-MAY_RUN = (*CAN_FLY, Phase.ARMING)
-AIRBORNE = (Phase.FLYING, Phase.LEVEL_OUT)
+CAN_FLY = (ArmingPhase.READY, ArmingPhase.FLYING, ArmingPhase.LEVEL_OUT, ArmingPhase.LANDED)
+MAY_RUN = (*CAN_FLY, ArmingPhase.ARMING)
+AIRBORNE = (ArmingPhase.FLYING, ArmingPhase.LEVEL_OUT)
 
 
 class Conditions(NamedTuple):
@@ -62,54 +62,54 @@ class Conditions(NamedTuple):
 
 Test = Callable[[Conditions], bool]
 # Transitions of each phase: the first test that is true selects the next phase; with none the phase stays.
-TRANSITIONS: dict[Phase, tuple[tuple[Test, Phase], ...]] = {
-    Phase.UNKNOWN: ((lambda now: True, Phase.CHECKS_FAILED),),
-    Phase.CHECKS_FAILED: (
-        (lambda now: now.emergency, Phase.STOPPED),
-        (lambda now: not now.tumbled, Phase.CHECKS_PASSED),
+TRANSITIONS: dict[ArmingPhase, tuple[tuple[Test, ArmingPhase], ...]] = {
+    ArmingPhase.UNKNOWN: ((lambda now: True, ArmingPhase.CHECKS_FAILED),),
+    ArmingPhase.CHECKS_FAILED: (
+        (lambda now: now.emergency, ArmingPhase.STOPPED),
+        (lambda now: not now.tumbled, ArmingPhase.CHECKS_PASSED),
     ),
-    Phase.CHECKS_PASSED: (
-        (lambda now: now.emergency, Phase.STOPPED),
-        (lambda now: now.tumbled, Phase.CHECKS_FAILED),
-        (lambda now: now.armed, Phase.ARMING),
+    ArmingPhase.CHECKS_PASSED: (
+        (lambda now: now.emergency, ArmingPhase.STOPPED),
+        (lambda now: now.tumbled, ArmingPhase.CHECKS_FAILED),
+        (lambda now: now.armed, ArmingPhase.ARMING),
     ),
-    Phase.ARMING: (
-        (lambda now: now.emergency, Phase.STOPPED),
-        (lambda now: now.tumbled or not now.armed, Phase.CHECKS_FAILED),
-        (lambda now: True, Phase.READY),
+    ArmingPhase.ARMING: (
+        (lambda now: now.emergency, ArmingPhase.STOPPED),
+        (lambda now: now.tumbled or not now.armed, ArmingPhase.CHECKS_FAILED),
+        (lambda now: True, ArmingPhase.READY),
     ),
-    Phase.READY: (
-        (lambda now: now.emergency, Phase.STOPPED),
-        (lambda now: now.tumbled or now.waited or not now.armed, Phase.CHECKS_FAILED),
-        (lambda now: now.flying, Phase.FLYING),
+    ArmingPhase.READY: (
+        (lambda now: now.emergency, ArmingPhase.STOPPED),
+        (lambda now: now.tumbled or now.waited or not now.armed, ArmingPhase.CHECKS_FAILED),
+        (lambda now: now.flying, ArmingPhase.FLYING),
     ),
-    Phase.FLYING: (
-        (lambda now: now.timed_out or now.emergency, Phase.STOPPED),
-        (lambda now: now.tumbled, Phase.CRASHED),
-        (lambda now: not now.armed, Phase.RESET),
-        (lambda now: now.silent, Phase.LEVEL_OUT),
-        (lambda now: not now.flying, Phase.LANDED),
+    ArmingPhase.FLYING: (
+        (lambda now: now.timed_out or now.emergency, ArmingPhase.STOPPED),
+        (lambda now: now.tumbled, ArmingPhase.CRASHED),
+        (lambda now: not now.armed, ArmingPhase.RESET),
+        (lambda now: now.silent, ArmingPhase.LEVEL_OUT),
+        (lambda now: not now.flying, ArmingPhase.LANDED),
     ),
-    Phase.LANDED: (
-        (lambda now: now.landed or not now.armed, Phase.RESET),
-        (lambda now: now.flying, Phase.FLYING),
+    ArmingPhase.LANDED: (
+        (lambda now: now.landed or not now.armed, ArmingPhase.RESET),
+        (lambda now: now.flying, ArmingPhase.FLYING),
     ),
-    Phase.RESET: ((lambda now: True, Phase.CHECKS_FAILED),),
+    ArmingPhase.RESET: ((lambda now: True, ArmingPhase.CHECKS_FAILED),),
     # Motors that are off do not end this phase: a drone whose laptop falls silent within 2 s of the last thrust locks.
-    Phase.LEVEL_OUT: (
-        (lambda now: now.timed_out or now.tumbled or now.emergency, Phase.STOPPED),
-        (lambda now: not now.silent, Phase.FLYING),
+    ArmingPhase.LEVEL_OUT: (
+        (lambda now: now.timed_out or now.tumbled or now.emergency, ArmingPhase.STOPPED),
+        (lambda now: not now.silent, ArmingPhase.FLYING),
     ),
-    Phase.STOPPED: ((lambda now: True, Phase.LOCKED),),
-    Phase.LOCKED: (),
-    Phase.CRASHED: (
-        (lambda now: not (now.crashed or now.tumbled), Phase.CHECKS_FAILED),
-        (lambda now: now.emergency, Phase.LOCKED),
+    ArmingPhase.STOPPED: ((lambda now: True, ArmingPhase.LOCKED),),
+    ArmingPhase.LOCKED: (),
+    ArmingPhase.CRASHED: (
+        (lambda now: not (now.crashed or now.tumbled), ArmingPhase.CHECKS_FAILED),
+        (lambda now: now.emergency, ArmingPhase.LOCKED),
     ),
 }
 
 
-def after(phase: Phase, now: Conditions) -> Phase:
+def after(phase: ArmingPhase, now: Conditions) -> ArmingPhase:
     """Return the phase that follows `phase` under the conditions `now`."""
     return next((new for test, new in TRANSITIONS[phase] if test(now)), phase)
 
@@ -120,7 +120,7 @@ class Supervisor:
     def __init__(self, kind: DroneKind, now: float = 0.0, booted: bool = True):
         """Start at `now` [s], with its checks passed if `booted`, else before its first update."""
         self.kind = kind
-        self.phase = Phase.UNKNOWN
+        self.phase = ArmingPhase.UNKNOWN
         self.armed = self.crashed = self.emergency = self.tumbled = False
         self.stopped = 0.0  # parameter stabilizer.stop: an emergency while it is not 0
         self.tumble_check = 1.0
@@ -131,9 +131,9 @@ class Supervisor:
         self._tumble_time: float | None = None
         self._ready_since = self._landed_since = now
         if booted:
-            self._enter(Phase.CHECKS_PASSED, now)
+            self._enter(ArmingPhase.CHECKS_PASSED, now)
             if kind.auto_arm:
-                self._enter(Phase.READY, now)
+                self._enter(ArmingPhase.READY, now)
         self.info = self._bits()
 
     @property
@@ -148,14 +148,14 @@ class Supervisor:
 
     def request_arming(self, wanted: bool) -> bool:
         """Arm or disarm; return whether the drone is in the `wanted` state."""
-        if wanted and not self.armed and self.phase is not Phase.CHECKS_PASSED:
+        if wanted and not self.armed and self.phase is not ArmingPhase.CHECKS_PASSED:
             return False
         self.armed = wanted
         return True
 
     def crash(self) -> None:
         """Enter the crashed phase, as after a tumble in flight."""
-        self._enter(Phase.CRASHED, self._ready_since)
+        self._enter(ArmingPhase.CRASHED, self._ready_since)
 
     def recover(self) -> bool:
         """Clear a crash; return false while the drone is still tumbled."""
@@ -179,7 +179,7 @@ class Supervisor:
             timed_out=age > LOCK_AFTER,
             emergency=self.emergency or expired or bool(self.stopped),
             crashed=self.crashed,
-            waited=self.phase is Phase.READY and now - self._ready_since > self.preflight_time,
+            waited=self.phase is ArmingPhase.READY and now - self._ready_since > self.preflight_time,
             landed=now - self._landed_since > self.landed_time,
         )
         new = after(self.phase, found)
@@ -187,17 +187,17 @@ class Supervisor:
             self._enter(new, now)
         self.info = self._bits()
 
-    def _enter(self, phase: Phase, now: float) -> None:
+    def _enter(self, phase: ArmingPhase, now: float) -> None:
         self.phase = phase
-        if phase is Phase.READY:
+        if phase is ArmingPhase.READY:
             self._ready_since = now
-        if phase is Phase.LANDED:
+        if phase is ArmingPhase.LANDED:
             self._landed_since = now
-        if phase is Phase.CRASHED:
+        if phase is ArmingPhase.CRASHED:
             self.crashed = True
         if phase not in MAY_RUN:
             self.armed = False
-        if phase is Phase.CHECKS_PASSED and self.kind.auto_arm:
+        if phase is ArmingPhase.CHECKS_PASSED and self.kind.auto_arm:
             self.armed = True
 
     def _tumbling(self, now: float, x: float, y: float, z: float) -> bool:
@@ -215,13 +215,13 @@ class Supervisor:
 
     def _bits(self) -> int:
         bits = {
-            packets.CAN_ARM: self.phase is Phase.CHECKS_PASSED,
+            packets.CAN_ARM: self.phase is ArmingPhase.CHECKS_PASSED,
             packets.ARMED: self.armed,
             packets.AUTO_ARMED: self.kind.auto_arm,
             packets.CAN_FLY: self.can_fly,
             packets.FLYING: self.phase in AIRBORNE,
             packets.TUMBLED: self.tumbled,
-            packets.LOCKED: self.phase is Phase.LOCKED,
+            packets.LOCKED: self.phase is ArmingPhase.LOCKED,
             packets.CRASHED: self.crashed,
         }
         return TRAJECTORY_FINISHED + sum(bit for bit, is_set in bits.items() if is_set)

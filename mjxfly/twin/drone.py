@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from mjxball.errors import InputError
-from mjxfly.app.host import App, Library, State
+from mjxfly.app.host import App, Library, OnboardState
 from mjxfly.app.protocol import CONTROLLER, GROUP, OUT_OF_TREE, PID
 from mjxfly.packets import ZERO, Setpoint
 from mjxfly.twin import avionics
@@ -72,7 +72,7 @@ class TwinDrone:
     def _new_app(self) -> App | None:
         self.beat = b""  # heartbeat in transit to the other drone
         self._ticks, self._next_tick, self._app_ran = 0, 0.0, False
-        self._app_state = State()  # set by the out-of-tree controller, the only access of an app to the estimate
+        self._app_state = OnboardState()  # set by the out-of-tree controller, the only access of an app to the estimate
         return None if self._core is None else App(self._core, self.number)
 
     def _on_parameter(self, name: str, value: float) -> None:

@@ -22,7 +22,7 @@ from mjxball.control.rotations import (
 )
 
 GRAVITY = 9.81  # [m/s2]
-LARGEST, LEAST = 100.0, 1e-6  # of the covariance
+MAX_COVARIANCE, MIN_VARIANCE = 100.0, 1e-6  # of the covariance
 START = np.array([100.0, 100.0, 1.0, *[0.01] * 6])  # standard deviations after a reset [m, m/s, rad]
 SLOW = 0.01  # [s] of a prediction
 # Variance that is added each millisecond, squared process noise: 0.5 and 1.0 m/s2, 0.1 rad/s.
@@ -48,7 +48,7 @@ class Kalman:
 
     def reset(self, position: np.ndarray | None = None, quaternion: np.ndarray | None = None) -> None:
         """Begin anew at the origin, level, or where the arguments say, with large variances."""
-        self.covariance = np.diag(np.minimum(START**2, LARGEST))
+        self.covariance = np.diag(np.minimum(START**2, MAX_COVARIANCE))
         self.position = np.zeros(3) if position is None else np.array(position)
         self.body_velocity = np.zeros(3)
         self.quaternion = UNIT.copy() if quaternion is None else np.array(quaternion)
@@ -128,9 +128,9 @@ def skew(v: np.ndarray) -> np.ndarray:
 
 def bounded(covariance: np.ndarray) -> np.ndarray:
     """`covariance` (9, 9) symmetric and within the filter's bounds."""
-    even = np.minimum(0.5 * (covariance + covariance.T), LARGEST)
+    even = np.minimum(0.5 * (covariance + covariance.T), MAX_COVARIANCE)
     diagonal = even.ravel()[::10]
-    np.maximum(diagonal, LEAST, out=diagonal)
+    np.maximum(diagonal, MIN_VARIANCE, out=diagonal)
     return even
 
 

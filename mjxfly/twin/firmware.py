@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from mjxfly.packets import ZERO, Setpoint
-from mjxfly.twin.arming import AIRBORNE, PERIOD, Phase, Supervisor
+from mjxfly.twin.arming import AIRBORNE, PERIOD, ArmingPhase, Supervisor
 from mjxfly.twin.conditions import DELIVERED, DroneKind
 
 THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors off; above: clipped
@@ -137,7 +137,7 @@ class Firmware:
             self._next_update += PERIOD
         phase = self.supervisor.phase
         setpoint = self.commander.setpoint if self.supervisor.can_fly else ZERO
-        if phase is Phase.LEVEL_OUT:
+        if phase is ArmingPhase.LEVEL_OUT:
             setpoint = Setpoint(0.0, 0.0, 0.0, setpoint.thrust)
         motors = Motors.RUN if self.supervisor.motors_allowed else Motors.OFF
         return Order(setpoint, motors, phase in AIRBORNE)
@@ -161,9 +161,9 @@ class Firmware:
     @property
     def locked(self) -> bool:
         """True if only a reboot lets the motors run again."""
-        return self.supervisor.phase is Phase.LOCKED
+        return self.supervisor.phase is ArmingPhase.LOCKED
 
     @property
     def booting(self) -> bool:
         """True between power on and the supervisor's first update."""
-        return self.supervisor.phase is Phase.UNKNOWN
+        return self.supervisor.phase is ArmingPhase.UNKNOWN

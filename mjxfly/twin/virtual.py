@@ -27,7 +27,7 @@ from mjxfly.monitor import down_reason
 from mjxfly.packets import Packet
 from mjxfly.preflight import parameters_of
 from mjxfly.setpoints import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
-from mjxfly.supervisor import State, Supervisor
+from mjxfly.supervisor import FlightState, Supervisor
 from mjxfly.telemetry import HealthSample, Note, Rig, SensedSample, Telemetry
 from mjxfly.twin import logs
 from mjxfly.twin.arming import PERIOD
@@ -234,7 +234,7 @@ class VirtualTwin:
             self.advance(STEP + late)
         self.state = getattr(self.pair, "place")(start)  # noqa: B009 - not every pair has it
         self.advance(0.02 + late)
-        self.flight.supervisor = Supervisor(State.FLY, self.now)
+        self.flight.supervisor = Supervisor(FlightState.FLY, self.now)
 
     def next_flight(self, pause: float = 3.0, settle: float = 1.0) -> Flight:
         """Begin another flight of the same drones without reboot, after `pause` [s] of a silent link.
@@ -267,7 +267,7 @@ class VirtualTwin:
         self.fly_for(limit)
         return self.flight.supervisor.state.value
 
-    def fly_until(self, wanted: State, limit: float = 30.0) -> None:
+    def fly_until(self, wanted: FlightState, limit: float = 30.0) -> None:
         """Tick until the supervisor is in the state `wanted`. Raises AssertionError after `limit` [s]."""
         end = self.now + limit
         while self.flight.supervisor.state is not wanted:

@@ -18,7 +18,7 @@ from mjxfly.limits import NAMES
 from mjxfly.log_schema import Record
 from mjxfly.packets import DroneState
 from mjxfly.recording import LONGEST, FirmwareSetup
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.telemetry import Rig, object_state
 from mjxfly.view.marks import FlightStatus, placed
 
@@ -99,7 +99,7 @@ class LiveLog:
 
     def _tick(self, record: Record) -> None:
         states = [state for state in self._newest if state is not None]
-        if self._target is None or record["state"] != State.LAND.value:  # see `Recording.target`
+        if self._target is None or record["state"] != FlightState.LAND.value:  # see `Recording.target`
             self._target = record["goal"]
         now = record["t"]
         self._start = now if self._start is None else self._start

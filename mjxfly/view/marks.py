@@ -12,12 +12,12 @@ from mjxball.view.flight import Mark
 from mjxfly.flight_log import LONGEST_LINE, read
 from mjxfly.log_import import is_foreign
 from mjxfly.log_schema import Record, decode
-from mjxfly.supervisor import FAULTS, State
+from mjxfly.supervisor import FAULTS, FlightState
 
-GOOD = {State.FLY.value, State.LAND.value}  # both controllers are in command
-BAD = {State.HOLD.value, State.DESCEND.value, State.KILL.value}
-OVER = {State.STOP.value, State.DONE.value}  # they keep the level of the state before
-SEVERITY = {state.value: state.severity for state in State}
+GOOD = {FlightState.FLY.value, FlightState.LAND.value}  # both controllers are in command
+BAD = {FlightState.HOLD.value, FlightState.DESCEND.value, FlightState.KILL.value}
+OVER = {FlightState.STOP.value, FlightState.DONE.value}  # they keep the level of the state before
+SEVERITY = {state.value: state.severity for state in FlightState}
 FAULT_NAMES = {event.name for event in FAULTS}
 STREAMS = (b'"kind": "state"', b'"kind": "health"', b'"kind": "pose"')  # most lines of a log; they make no marks
 
@@ -74,7 +74,7 @@ class FlightStatus:
         if causes:
             self.level = "bad"
             self.marks.append(Mark(now, "fault", ", ".join(map(_words, causes)), "bad"))
-        if causes or (severity > State.FLY.severity and events):
+        if causes or (severity > FlightState.FLY.severity and events):
             self._why = self._why or _words((causes or events)[0])
         self._phase(now, after)
         self._enter(after)

@@ -18,7 +18,7 @@ from command_line import TRANSPORT, assert_refused
 from conftest import with_settings
 from tables import weekly
 
-from mjxball.algorithms.base import Phase, Shards
+from mjxball.algorithms.base import Shards, TrainingPhase
 from mjxball.algorithms.gradient import FirstOrderGradient, starts_anew
 from mjxball.commands.train import main
 from mjxball.config import Config, preset
@@ -30,12 +30,12 @@ from mjxball.policy.file import PolicyFile, load_file, shipped_policy
 from mjxball.sim.follower import follower_law
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
-from mjxball.train.program import Environments, Program
+from mjxball.train.program import Environments, TrainingProgram
 from mjxball.train.run_directory import file_hash, start_policy
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 Q, R = np.diag([1.0, 0.1]), np.array([[0.05]])
-TRAIN = Phase(jnp.asarray(False), jnp.asarray(False))
+TRAIN = TrainingPhase(jnp.asarray(False), jnp.asarray(False))
 SMALL = {
     "ppo": {"total_steps": 40_960, "num_envs": 64, "unroll_length": 16, "minibatches": 4, "learning_rate": 3e-3},
     "gradient": {"gradient_steps": 60, "num_envs": 16, "horizon": 40, "num_evaluations": 2, "policy_layers": (16, 16)},
@@ -211,7 +211,7 @@ def test_the_first_window_normalises_the_observations(transport: Config) -> None
     environments = Environments(Standing(), 32, Shards())
     algorithm = FirstOrderGradient(transport, environments)
     states = environments.reset(jax.random.PRNGKey(0))
-    first = Phase(jnp.asarray(True), jnp.asarray(False))
+    first = TrainingPhase(jnp.asarray(True), jnp.asarray(False))
     known, _ = algorithm.collect(
         algorithm.init(jax.random.PRNGKey(1)), environments.begin(states), [jax.random.PRNGKey(2)], first
     )
@@ -223,7 +223,7 @@ def test_the_first_window_normalises_the_observations(transport: Config) -> None
 
 def returns(config: Config, name: str, env: Any, seed: int = 0) -> np.ndarray:
     """Mean reward a step of the policy after the whole training, and of the one before it."""
-    program = Program(config, "newton-euler", extensions=Extensions(env, None, find(name, "--algorithm")))
+    program = TrainingProgram(config, "newton-euler", extensions=Extensions(env, None, find(name, "--algorithm")))
     advance, evaluate = jax.jit(program.advance), programs.evaluate(80)
     state = jax.jit(program.create)(jax.random.PRNGKey(seed))
     fresh = program.evaluation_envs(jax.random.PRNGKey(7))
@@ -266,7 +266,7 @@ def test_a_point_is_pushed_to_rest(name: str, transport: Config) -> None:
 def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     config = with_settings(transport, timing={"episode_steps": 80}, **{name: SMALL[name]})
     extensions = Extensions(toys.DoubleIntegrator, None, find(name, "--algorithm"))
-    program = Program(config, "newton-euler", extensions=extensions)
+    program = TrainingProgram(config, "newton-euler", extensions=extensions)
     advance, window = jax.jit(program.advance), program.algorithm.steps_per_collect
     start, *_ = advance(jax.jit(program.create)(jax.random.PRNGKey(0)), programs.warmup(program.warmup_rounds))
     once, *_ = advance(start, programs.train(4 * window))

@@ -18,7 +18,7 @@ from tables import rows, weekly
 
 from algorithms.test_algorithms import TRAIN, A, B, LinearQuadratic, Q, R, gradient_of
 from mjxball.algorithms import ppo, sac
-from mjxball.algorithms.base import Phase, Shards
+from mjxball.algorithms.base import Shards, TrainingPhase
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.algorithms.sac import SoftActorCritic
@@ -191,7 +191,7 @@ def test_what_was_seen_once_is_remembered(name: str, transport: Config, monkeypa
         known, _ = algorithm.update(known, keys[1], jnp.float32(0.5), keys[2])
         return (known, envs), None
 
-    def keys_of(seed: int, count: int, phase: Phase) -> Any:
+    def keys_of(seed: int, count: int, phase: TrainingPhase) -> Any:
         many = jax.random.split(jax.random.key(seed), (count, algorithm.collect_keys + algorithm.update_keys))
         phases = jax.tree.map(lambda part: jnp.broadcast_to(part, count), phase)
         parts = [many[:, k] for k in range(many.shape[1])]
@@ -202,7 +202,7 @@ def test_what_was_seen_once_is_remembered(name: str, transport: Config, monkeypa
     warm = algorithm.schedule.warmup_steps // (64 * algorithm.steps_per_collect)
     scan = jax.jit(lambda carry, keys: jax.lax.scan(one, carry, keys)[0])
     if warm:
-        carry = scan(carry, keys_of(2, warm, Phase(jnp.asarray(True), jnp.asarray(False))))
+        carry = scan(carry, keys_of(2, warm, TrainingPhase(jnp.asarray(True), jnp.asarray(False))))
     known, _ = scan(carry, keys_of(3, LEARNING[name][3], TRAIN))
     assert paid(algorithm.policy(known)) < 0.02
     assert paid(algorithm.policy(algorithm.init(jax.random.key(1)))) > 0.15

@@ -31,8 +31,8 @@ from mjxball.baselines.motion import (
     VX,
     VY,
 )
-from mjxball.baselines.mpc import BEYOND, BLOCKS, MASSES, Mpc, Program, limit_rows
-from mjxball.baselines.mpc_design import MEASURED, MEMORY, PAIR_STATES, Design, design, limits_of
+from mjxball.baselines.mpc import BEYOND, BLOCKS, MASSES, Mpc, QuadraticProgram, limit_rows
+from mjxball.baselines.mpc_design import MEASURED, MEMORY, PAIR_STATES, MpcDesign, design, limits_of
 from mjxball.config import Config, preset, with_plant
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import mount_angles
@@ -50,11 +50,11 @@ NOMINAL = MASSES.index(0.2)
 HOVER = np.array([1.1 * 9.81 / 4])  # [N] of each rotor, with 0.2 kg
 
 
-def law() -> Design:
+def law() -> MpcDesign:
     return design(PAPER, TUNING, MASSES[NOMINAL])
 
 
-def cost(own: Design, x: np.ndarray, corrections: np.ndarray) -> float:
+def cost(own: MpcDesign, x: np.ndarray, corrections: np.ndarray) -> float:
     """Of errors, speeds and mean commands along x until the motion has died out, after `corrections` (k,) of pitch."""
     total = 0.0
     for step in range(1500):
@@ -90,7 +90,7 @@ def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
     x = own.transition @ np.reshape(state, (-1, state.shape[-1]))[0, : len(own.transition)]
     limits = limits_of(plant)
     hover = np.array([(limits.own_mass + limits.load_share * mass) * 9.81 / 4])
-    assert not Program(own, limits, mass).broken(x[None], hover).any()
+    assert not QuadraticProgram(own, limits, mass).broken(x[None], hover).any()
     expected = np.broadcast_to(own.feedback @ x, command.shape)
     np.testing.assert_allclose(
         command, expected if angles is None else turned_about_z(expected, -angles), rtol=1e-9, atol=1e-15
@@ -124,7 +124,7 @@ def test_estimates_of_followers_that_measure_apart_are_forgotten() -> None:
 def test_the_program_is_solved_as_another_solver_does() -> None:
     """The same program with its slack eliminated, v'Wv + cost of what goes beyond, by L-BFGS."""
     own, random = law(), np.random.default_rng(1)
-    program, count = Program(own, LIMITS, MASSES[NOMINAL]), 3 * len(BLOCKS)
+    program, count = QuadraticProgram(own, LIMITS, MASSES[NOMINAL]), 3 * len(BLOCKS)
     states, rows, low, high, lifting = limit_rows(own, LIMITS, 1.1)
     weights = np.outer(BLOCKS, own.cost).ravel()
     scaled = np.maximum(np.linalg.norm(rows / np.sqrt(weights), axis=1), 1e-3)
@@ -153,7 +153,7 @@ def test_limits_are_kept_that_the_lqr_breaks(plant: Config) -> None:
     law, limits, mass = make_law("mpc", plant), limits_of(plant), plant.plant.object_mass
     kind = round(10 * mass)
     own, tuning = law.designs[kind], law.team_tuning if plant.plant.is_team else law.tuning
-    program, carried = Program(own, limits, MASSES[kind]), limits.own_mass + limits.load_share * mass
+    program, carried = QuadraticProgram(own, limits, MASSES[kind]), limits.own_mass + limits.load_share * mass
     hover = np.array([carried * 9.81 / 4])
     for follows in (False, True):
         x, tilts, forces = np.zeros(len(own.transition)), [], []

@@ -13,7 +13,7 @@ from tables import weekly
 from mjxball.policy import Policy, shipped_policy
 from mjxfly.limits import FlightSettings, Times
 from mjxfly.packets import THRUST_CEILING
-from mjxfly.supervisor import Event, State
+from mjxfly.supervisor import Event, FlightState
 from mjxfly.twin.conditions import FAULT_KINDS
 from mjxfly.twin.virtual import MemoryLog
 from mjxfly.twin.virtual import VirtualTwin as CoupledTwin
@@ -126,11 +126,11 @@ AT = [
 def test_any_fault_brings_both_down(fault: Callable[[VirtualTwin, int], None], number: int) -> None:
     event, first = FAULTS[fault]
     world = VirtualTwin(FlightSettings(seconds=SECONDS + 10, times=QUICK))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(1.0)
     fault(world, number)
     world.fly_for(SECONDS + SAFE_WITHIN)
-    assert world.flight.supervisor.state is State.DONE
+    assert world.flight.supervisor.state is FlightState.DONE
     assert world.log.transitions()[4] == first
     cause = world.flight.supervisor.cause
     assert (cause.event if cause else None) is event
@@ -148,13 +148,13 @@ def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
     fault: Callable[[VirtualTwin, int], None], number: int
 ) -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.5)
     fault(world, number)
     if fault is silence_up:
         world.fault_link(number, silent_up=True, silent_down=True)
     began = world.now
-    world.fly_until(State.STOP)
+    world.fly_until(FlightState.STOP)
     # The firmware of the lost drone stops it 2 s after its last setpoint; the other must not have stopped long before.
     assert world.now - began == pytest.approx(2.0, abs=0.15)
     tilt = [world.state.quaternion[0, 1], world.state.quaternion[0, 2]]
@@ -164,33 +164,33 @@ def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
 @pytest.mark.parametrize("number", [0, *weekly(1)])
 def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0, times=QUICK))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.0)
     silence(world, number)
     world.drones[number].firmware.dead = True
     began = world.now
-    world.fly_until(State.STOP)
+    world.fly_until(FlightState.STOP)
     # It cannot be told from one that only is not heard, but for the stick that tips: 100 ms to miss it, then its fall.
     assert world.now - began < 0.6
     assert world.log.transitions()[4:6] == ["hold", "stop"]
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.running() == [False, False]
 
 
 @pytest.mark.slow
 def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(1.0)
     silence_up(world, 1)
     began = world.now
-    world.fly_until(State.HOLD)
+    world.fly_until(FlightState.HOLD)
     # Four packets of 50 ms must show a thrust that stands still and was not sent for 0.1 s; its motors stop after 2 s.
     assert world.now - began < 0.35
     assert world.flight.supervisor.cause.event is Event.UNHEARD
-    world.fly_until(State.STOP)
+    world.fly_until(FlightState.STOP)
     assert world.now - began == pytest.approx(2.0, abs=0.1)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     world.advance(2.5)
     assert world.running() == [False, False]
 
@@ -198,21 +198,21 @@ def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -
 @pytest.mark.parametrize("seconds", [0.4, *weekly(0.11)])
 def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
     world = VirtualTwin(FlightSettings(seconds=6.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.0)
     for number in range(2):
         world.fault_link(number, silent_down=True)
     world.fly_for(seconds)
     for number in range(2):
         world.fault_link(number, silent_down=False)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
     assert world.flight.supervisor.cause is None
     assert world.flight.lifted
 
 
-@pytest.mark.parametrize("state", [State.FLY, *weekly(State.RAMP, State.LAND)])
-def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
+@pytest.mark.parametrize("state", [FlightState.FLY, *weekly(FlightState.RAMP, FlightState.LAND)])
+def test_a_link_that_is_almost_dead_ends_the_flight(state: FlightState) -> None:
     """States that come and go must not let hold and descent take turns for ever."""
     world = VirtualTwin(FlightSettings(seconds=1.0))
     world.fly_until(state)
@@ -220,7 +220,7 @@ def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
     for number in range(2):
         world.fault_link(number, loss=0.95)
     world.fly_for(15.0)
-    assert world.flight.supervisor.state is State.DONE
+    assert world.flight.supervisor.state is FlightState.DONE
     world.advance(2.5)
     assert world.running() == [False, False]
 
@@ -228,23 +228,23 @@ def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
 @pytest.mark.slow
 def test_states_that_break_off_again_and_again_end_the_flight() -> None:
     world = VirtualTwin(FlightSettings(seconds=60.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     for _ in range(world.flight.settings.limits.gaps + 1):
         world.fly_for(0.5)
         silence_down(world, 1)
         world.fly_for(0.15)
         world.fault_link(1, silent_down=False)
-    world.fly_until(State.LAND)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.LAND)
+    world.fly_until(FlightState.DONE)
     assert world.flight.supervisor.cause.event is Event.GAPS
 
 
 def test_a_frozen_estimator_is_found() -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0, goal=(0.8, 0.5, 0.8)))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(0.4)
     frozen(world, 0)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.flight.supervisor.cause is not None
     assert world.running() == [False, False]
 
@@ -254,7 +254,7 @@ def test_poses_that_stand_still_in_the_ramp_end_it_on_the_ground() -> None:
     pytest.importorskip("mujoco")
     policy = Policy.load(shipped_policy("flight"))
     world = CoupledTwin(policy, FlightSettings(seconds=5.0), log=MemoryLog(False), settle=1.0)
-    world.fly_until(State.RAMP)
+    world.fly_until(FlightState.RAMP)
     world.fly_for(0.2)
     for drone in world.drones:
         drone.inject(FAULT_KINDS["pose-frozen"].what)
@@ -269,10 +269,10 @@ def test_a_pair_that_never_acted_on_a_thrust_is_held_for_the_whole_time_of_its_w
     world = VirtualTwin(FlightSettings(seconds=5.0))
     for watch in world.flight._monitor.uplinks:
         watch.sent = lambda thrust, now: None
-    world.fly_until(State.HOLD)
+    world.fly_until(FlightState.HOLD)
     began = world.now
-    world.fly_until(State.STOP)
+    world.fly_until(FlightState.STOP)
     assert world.flight.supervisor.cause.event is Event.UNHEARD
     assert 0.2 < world.now - began <= world.flight.settings.times.drone_watchdog + 0.02
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert [drone.firmware.locked for drone in world.drones] == [False, False]

@@ -18,7 +18,7 @@ from mjxball.policy.file import shipped_policy
 from mjxfly import card
 from mjxfly.limits import FlightSettings
 from mjxfly.setpoints import ForceCurve, to_setpoint
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.physics import StandIn, make_pair
 
 PRESETS = ("flight", "stand")
@@ -36,14 +36,14 @@ def world_of(preset: str, seconds: float) -> VirtualTwin:
 @pytest.mark.slow
 def test_a_free_flight_rises_stays_and_lands() -> None:
     world = world_of("flight", 5.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(3.0)
     heights, tilts = [], []
-    while world.flight.supervisor.state is State.FLY:
+    while world.flight.supervisor.state is FlightState.FLY:
         world.tick()
         heights.append(world.state.position[:, 2].mean())
         tilts.append(np.abs(rotations.euler_from_matrix(rotations.matrix_from_quaternion(world.state.quaternion[0]))))
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
     assert world.flight.supervisor.cause is None
     assert min(heights) > 0.3
@@ -57,12 +57,12 @@ def test_a_free_flight_rises_stays_and_lands() -> None:
 @pytest.mark.slow
 def test_the_papers_stand_lifts_off_rolls_and_comes_down() -> None:
     world = world_of("stand", 3.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.9)
     there = world.state.position
     assert (there[:, :1] == 0).all()
     assert there[:, 2].mean() > 0.005  # the paper's gains and its thrust scale let height drift
-    world.fly_until(State.DONE, 40.0)
+    world.fly_until(FlightState.DONE, 40.0)
     assert world.log.transitions()[-2:] == ["stop", "done"]
     assert world.flight.supervisor.cause is None
     world.advance(1.0)
@@ -75,7 +75,7 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
     config = card.config_of(untrained(preset).card)
     assert config == configs.preset(preset)
     world = world_of(preset, 2.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(1.0)
     commands = world.flight._commands
     own = preset == "stand"  # e_l of the leader's own place feels the roll, e_o does not

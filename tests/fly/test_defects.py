@@ -16,7 +16,7 @@ from mjxfly.card import Controller, goal_of, times_of
 from mjxfly.limits import FlightSettings, Limits
 from mjxfly.packets import FLYING, LOCKED
 from mjxfly.preflight import curve_of_version
-from mjxfly.supervisor import Event, State
+from mjxfly.supervisor import Event, FlightState
 from mjxfly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
 from mjxfly.twin.virtual import MemoryLog, VirtualTwin
 
@@ -92,7 +92,7 @@ def pushed(world: VirtualTwin, monkeypatch: pytest.MonkeyPatch, *vertical: float
 def test_thrust_moves_as_fast_as_the_law_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Defect 4: a slew limit of 1200 units a tick, which training does not have, took 0.4 of the roll authority."""
     world = world_of("flight", 2.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     pushed(world, monkeypatch, -1.0, 1.0)
     world.fly_for(0.2)
     ticks = [record["sent"][0].thrust for record in world.log.records if record["kind"] == "tick"]
@@ -104,7 +104,7 @@ def test_thrust_moves_as_fast_as_the_law_asks(monkeypatch: pytest.MonkeyPatch) -
 def test_a_stand_has_a_ceiling_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Defect 5: O rose to 0.8 - 1.4 m before anything ended the flight."""
     world = world_of("stand", 10.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     pushed(world, monkeypatch, 0.5)
     world.run(30.0)
     assert world.flight.supervisor.cause.event is Event.FENCE
@@ -155,7 +155,7 @@ def test_the_stand_keeps_its_ball_under_the_estimators_sideways_motion() -> None
 def test_an_estimator_that_loses_its_pose_brings_the_pair_down_gently(kind: str, drones: tuple[int, ...]) -> None:
     """Defect 6: lost poses were not noticed, frozen ones cut the motors at 0.2 m, a jump at 0.4 m (2.7 m/s)."""
     world = world_of("flight", 4.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(1.5)
     for drone in drones:
         world.pair.disturb(drone, kind, 0.4 if kind == "jump" else 1.0)
@@ -169,14 +169,14 @@ def test_an_estimator_that_loses_its_pose_brings_the_pair_down_gently(kind: str,
 def test_a_gap_in_the_states_costs_nothing() -> None:
     """Defect 8: 110 ms without states gave 1.9 s of blind flight and 0.25 to 0.48 m of drift."""
     world = world_of("flight", 4.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.5)
     before = world.state.position.mean(axis=0)
     for silent in (True, False):
         for number in range(2):
             world.fault_link(number, silent_down=silent)
         world.fly_for(0.13)
-    assert world.flight.supervisor.state is State.FLY
+    assert world.flight.supervisor.state is FlightState.FLY
     world.fly_for(1.0)
     assert np.linalg.norm(world.state.position.mean(axis=0) - before) < 0.03
     world.run(30.0)

@@ -22,12 +22,14 @@ from command_line import environment
 from mjxfly.display import RED, Display, View, lines
 from mjxfly.limits import Limits
 from mjxfly.packets import ZERO, DroneState
-from mjxfly.supervisor import Event, Fault, State, Supervisor
+from mjxfly.supervisor import Event, Fault, FlightState, Supervisor
 
 LIMITS = Limits()
 
 
-def view(state: State = State.FLY, cause: Fault | None = None, battery: float = 4.0, age: float = 0.01) -> View:
+def view(
+    state: FlightState = FlightState.FLY, cause: Fault | None = None, battery: float = 4.0, age: float = 0.01
+) -> View:
     drone = DroneState(np.array([0.1, -0.2, 0.3]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0, battery)
     return View(1.0, Supervisor(state, 0.0, cause), [drone] * 2, [age] * 2, (ZERO, ZERO), 0.0, 0)
 
@@ -44,8 +46,8 @@ def test_a_good_flight_has_no_red() -> None:
 @pytest.mark.parametrize(
     "danger",
     [
-        view(State.HOLD),
-        view(State.LAND, Fault(Event.BATTERY, "leader at 3.1 V")),
+        view(FlightState.HOLD),
+        view(FlightState.LAND, Fault(Event.BATTERY, "leader at 3.1 V")),
         view(battery=3.25),
         view(age=0.09),
         view(age=float("inf")),
@@ -56,14 +58,14 @@ def test_danger_is_red(danger: View) -> None:
 
 
 def test_without_colour_there_are_no_escapes() -> None:
-    assert "\x1b" not in "\n".join(lines(view(State.HOLD, Fault(Event.STALE), age=1.0), LIMITS, colour=False))
+    assert "\x1b" not in "\n".join(lines(view(FlightState.HOLD, Fault(Event.STALE), age=1.0), LIMITS, colour=False))
 
 
 @pytest.mark.parametrize("columns", [20, 40, 60, 80, 104, 105, 200])
 def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
     """A terminal breaks a line that is too long, and what is redrawn over it smears."""
     cause = Fault(Event.ESTIMATOR, "the leader's height is +12 cm from where the follower and the roll put it")
-    wide = view(State.DESCEND, cause)
+    wide = view(FlightState.DESCEND, cause)
     shown = lines(wide, LIMITS, False, columns)
     assert max(map(len, shown)) < columns
     words = " ".join(lines(wide, LIMITS, False, 500)).split()
@@ -91,7 +93,11 @@ def test_what_is_redrawn_covers_what_was_drawn() -> None:
 
 @pytest.mark.clock
 def test_what_cannot_go_back_a_line_gets_one_a_phase(monkeypatch: pytest.MonkeyPatch) -> None:
-    views = [view(State.RAMP)] * 2 + [view()] * 2 + [view(State.LAND, Fault(Event.BATTERY, "leader at 3.1 V"))] * 20
+    views = (
+        [view(FlightState.RAMP)] * 2
+        + [view()] * 2
+        + [view(FlightState.LAND, Fault(Event.BATTERY, "leader at 3.1 V"))] * 20
+    )
     stream = io.StringIO()
     with Display(lambda: views.pop(0) if len(views) > 1 else views[0], LIMITS, stream):
         time.sleep(1.6)

@@ -11,7 +11,7 @@ from tables import rows
 
 from mjxfly.ending import Signals, Touchdown
 from mjxfly.limits import FlightSettings
-from mjxfly.supervisor import Event, Fault, State
+from mjxfly.supervisor import Event, Fault, FlightState
 
 LINK, OLD = Fault(Event.LINK_LOST, "leader: nothing can be sent"), Fault(Event.STALE, "state of the leader is 0 ms old")
 BUSY, TILT = Fault(Event.DEADLINES, "12 missed in a second"), Fault(Event.TILT, "follower tilts 41 degrees")
@@ -53,7 +53,7 @@ def measured(text: str) -> float:
 @pytest.mark.parametrize("asked", [False, True])
 def test_a_good_flight_says_how_it_landed(asked: bool) -> None:
     world = VirtualTwin(FlightSettings(seconds=2.0, goal=(0.2, -0.1, 0.4)))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     if asked:
         world.fly_for(1.5)
         world.flight.interrupts = 1
@@ -69,12 +69,12 @@ def test_a_good_flight_says_how_it_landed(asked: bool) -> None:
 def test_a_busy_computer_is_no_lost_link() -> None:
     """A stall of 134 ms held the pair for 2 s, blind, and was called a lost link."""
     world = VirtualTwin(FlightSettings(seconds=9.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.0)
     world.advance(0.134)
     world.links[0].stuck = 0.134  # nobody sent meanwhile
     world.flight.tick(world.now, 0.124, 12, 0.134)
-    assert world.flight.supervisor.state is State.DESCEND
+    assert world.flight.supervisor.state is FlightState.DESCEND
     world.links[0].stuck = 0.0
     world.run()
     why, down = world.flight.how_it_ended()
@@ -86,7 +86,7 @@ def test_a_busy_computer_is_no_lost_link() -> None:
 
 def test_a_link_that_fails_is_no_busy_computer() -> None:
     world = VirtualTwin(FlightSettings(seconds=9.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(0.7)
     world.flight.tick(world.now, 0.03, 3, 0.05)
     world.fly_for(1.26)

@@ -18,7 +18,7 @@ from mjxfly.card import command_maps, config_of
 from mjxfly.lift import ALL, LiftWatch
 from mjxfly.limits import FlightSettings
 from mjxfly.setpoints import CommandMap
-from mjxfly.supervisor import Event, State
+from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import ObjectState, Rig
 from mjxfly.twin.conditions import FAULT_KINDS, Surroundings
 from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
@@ -33,7 +33,7 @@ def hovering(seconds: float = 20.0, height: float = HEIGHT, flown: float = 3.0) 
     pytest.importorskip("mujoco")
     settings = FlightSettings(seconds, (0.0, 0.0, height))
     world = VirtualTwin(Policy.load(FLIGHT), settings, log=MemoryLog(False), settle=1.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(flown)
     return world
 
@@ -121,7 +121,7 @@ def test_a_hold_is_not_flown_by_what_was_measured_a_moment_ago() -> None:
     pytest.importorskip("mujoco")
     settings, around = FlightSettings(3.0, (0.0, 0.0, 0.15)), Surroundings(seed=884, delay=0.03)
     world = VirtualTwin(Policy.load(FLIGHT), settings, surroundings=around, log=MemoryLog(False), settle=0.3)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(0.48)
     world.drones[0].inject(FAULT_KINDS["frozen"].what)
     world.fly_for(0.59)
@@ -150,12 +150,12 @@ def test_a_dead_imu_is_told_as_one() -> None:
 @pytest.mark.slow
 def test_an_uplink_that_comes_back_is_flown_through() -> None:
     world = StandInTwin(FlightSettings(seconds=6.0))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.0)
     for silent in (True, False):
         world.fault_link(1, silent_up=silent)
         world.fly_for(0.35)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
     assert world.flight.supervisor.cause is None
 

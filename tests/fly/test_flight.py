@@ -17,7 +17,7 @@ from tables import rows
 from mjxfly import packets, session
 from mjxfly.limits import FlightSettings, Times
 from mjxfly.setpoints import LastKnownState, Variant
-from mjxfly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
+from mjxfly.supervisor import AIRBORNE, Event, Fault, FlightState, Supervisor
 from mjxfly.watchdog import PERIOD, way_down
 
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
@@ -25,12 +25,12 @@ NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
 
 def test_a_flight_from_start_to_end() -> None:
     world = VirtualTwin(FlightSettings(seconds=5.0, goal=(0.2, -0.1, 0.5)))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(4.9)
     there = world.state.position.mean(axis=0)
     # The policy's card promises to settle within 2.8 s, but for another plant; 5 cm shows that signs are right.
     np.testing.assert_allclose(there, [0.2, -0.1, 0.5], atol=0.05)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.log.transitions() == NORMAL
     assert world.flight.supervisor.cause is None
     world.advance(0.05)
@@ -43,18 +43,18 @@ def test_a_flight_from_start_to_end() -> None:
 def test_a_brushless_pair_is_armed_under_zeros() -> None:
     world = VirtualTwin(kind=ARMED_BY_HAND)
     assert not world.drones[0].firmware.supervisor.armed
-    world.fly_until(State.SPIN)
+    world.fly_until(FlightState.SPIN)
     assert all(drone.firmware.supervisor.armed for drone in world.drones)
     assert {thrust for _, thrust in thrusts(world, 0)[:-1]} == {0}  # the last one is the first that turns
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.log.transitions() == NORMAL
 
 
 def test_a_dry_run_sends_zeros_and_never_arms() -> None:
     world = VirtualTwin(FlightSettings(seconds=1.0, dry_run=True), ARMED_BY_HAND)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     assert all(value.thrust > 10000 for value in world.flight.view.wanted)  # what it would have sent
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     for number in range(2):
         assert {thrust for _, thrust in thrusts(world, number)} == {0}
         others = {packet for _, packet in world.links[number].packets if packet.port != 3}
@@ -64,13 +64,13 @@ def test_a_dry_run_sends_zeros_and_never_arms() -> None:
 
 def test_one_interrupt_lands_and_a_second_one_kills() -> None:
     world = VirtualTwin()
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.flight.interrupts = 1
-    world.fly_until(State.LAND)
+    world.fly_until(FlightState.LAND)
     world.fly_for(0.2)
     assert world.running() == [True, True]
     world.flight.interrupts = 2
-    world.fly_until(State.KILL)
+    world.fly_until(FlightState.KILL)
     world.advance(0.1)  # the firmware looks every 40 ms: off at the first look, locked at the second
     assert world.running() == [False, False]
     assert all(drone.firmware.locked for drone in world.drones)
@@ -79,9 +79,9 @@ def test_one_interrupt_lands_and_a_second_one_kills() -> None:
 @pytest.mark.parametrize(("missed", "gap"), [(50, 0.01), (0, 0.2)])
 def test_a_loop_that_cannot_keep_up_descends(missed: int, gap: float) -> None:
     world = VirtualTwin()
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.flight.tick(world.now, 0.0, missed, gap)
-    assert world.flight.supervisor.state is State.DESCEND
+    assert world.flight.supervisor.state is FlightState.DESCEND
     assert world.flight.supervisor.cause.event is Event.DEADLINES
 
 
@@ -89,16 +89,16 @@ def test_thrust_at_its_bound_for_too_long_descends() -> None:
     world = VirtualTwin(FlightSettings(seconds=20.0))
     heavy = [Variant(dataclasses.replace(one, carried_mass=0.0434), {}) for one in world.flight.maps]
     world.flight.spin.chosen = lambda: (heavy[0], heavy[1])
-    world.fly_until(State.FLY)
-    world.fly_until(State.DESCEND)
+    world.fly_until(FlightState.FLY)
+    world.fly_until(FlightState.DESCEND)
     assert world.flight.supervisor.cause.event in (Event.SATURATED, Event.FENCE)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
 
 
 def test_failed_checks_never_turn_a_motor() -> None:
     world = VirtualTwin()
     world.flight.ready, world.flight.refusal = False, "battery"
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert world.log.transitions() == ["stop", "done"]
     assert {thrust for _, thrust in thrusts(world, 0)} == {0}
     assert world.flight.supervisor.cause.event is Event.REFUSED
@@ -115,7 +115,7 @@ def test_a_watchdog_that_dies_ends_the_flight() -> None:
             return alive[0]
 
     world.flight.watchdog = Guard()
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(2.0)
     flying, (trims, height, climb, _) = beats[-1]
     assert flying
@@ -124,19 +124,19 @@ def test_a_watchdog_that_dies_ends_the_flight() -> None:
     hover = world.flight.maps[0].hover_thrust
     assert all(abs(trim - hover) < 0.1 * hover for trim in trims)
     alive[0] = False
-    world.fly_until(State.LAND)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.LAND)
+    world.fly_until(FlightState.DONE)
     assert world.flight.supervisor.cause.event is Event.WATCHDOG
     assert not beats[-1][0]
 
 
 def test_an_abort_during_the_ramp_does_not_jump_to_hover() -> None:
     world = VirtualTwin()
-    world.fly_until(State.RAMP)
+    world.fly_until(FlightState.RAMP)
     world.fly_for(0.3)
     highest = max(thrust for _, thrust in thrusts(world, 0))
     world.fault_link(1, silent_down=True)
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     # The abort holds a running average of the ramp, and the ramp goes on for the 100 ms that it takes to see the fault.
     assert max(thrust for _, thrust in thrusts(world, 0)) < highest + 6000
 
@@ -173,8 +173,8 @@ def fail(world: VirtualTwin, guard: Guard) -> None:
     world.flight.watchdog, world.flight.begin, world.flight.tick = guard, lambda now: None, tick
 
 
-@rows("phase", [State.CHECK, State.ARM, State.SPIN])
-def test_a_bug_in_the_runner_on_the_ground_stops_both(phase: State) -> None:
+@rows("phase", [FlightState.CHECK, FlightState.ARM, FlightState.SPIN])
+def test_a_bug_in_the_runner_on_the_ground_stops_both(phase: FlightState) -> None:
     world, guard = VirtualTwin(), Guard()
     world.fly_until(phase)
     fail(world, guard)
@@ -183,7 +183,7 @@ def test_a_bug_in_the_runner_on_the_ground_stops_both(phase: State) -> None:
     assert not any(guard.beats)
     world.advance(0.05)
     assert world.running() == [False, False]
-    assert world.flight.supervisor.state is State.DONE
+    assert world.flight.supervisor.state is FlightState.DONE
     assert world.flight.supervisor.cause is not None
     assert any("RuntimeError: a bug" in record.get("text", "") for record in world.log.records)
 
@@ -199,13 +199,13 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
         raise Ended(code)
 
     monkeypatch.setattr(session.os, "_exit", ended)
-    for phase in (State.RAMP, State.FLY, State.LAND, State.DESCEND, State.HOLD):
+    for phase in (FlightState.RAMP, FlightState.FLY, FlightState.LAND, FlightState.DESCEND, FlightState.HOLD):
         world, guard, saved = VirtualTwin(FlightSettings(seconds=1.2, times=QUICK)), Guard(), []
-        world.fly_until(State.FLY if phase in (State.DESCEND, State.HOLD) else phase)
-        if phase in (State.DESCEND, State.HOLD):
+        world.fly_until(FlightState.FLY if phase in (FlightState.DESCEND, FlightState.HOLD) else phase)
+        if phase in (FlightState.DESCEND, FlightState.HOLD):
             world.fly_for(1.0)
             world.flight.supervisor = Supervisor(phase, world.now, Fault(Event.STICK))
-            world.flight._hold([]) if phase is State.HOLD else world.tick()
+            world.flight._hold([]) if phase is FlightState.HOLD else world.tick()
         seen, before = world.flight._last_known_state(), [len(link.packets) for link in world.links]
         fail(world, guard)
         with pytest.raises(Ended) as left:
@@ -226,7 +226,7 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
     def note(*_: object, **fields: object) -> None:
         raise OSError("no log")
 
-    world.flight.supervisor, world.flight.watchdog, world.flight.note = Supervisor(State.FLY), None, note
+    world.flight.supervisor, world.flight.watchdog, world.flight.note = Supervisor(FlightState.FLY), None, note
     with pytest.raises(Ended):  # the laws on board: nobody else takes over, and the apps land
         session.run(world.flight)
     assert "the apps on board land both drones" in capsys.readouterr().err
@@ -245,7 +245,7 @@ def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest
     """The landing key repeats while it is held, and a closed terminal sends SIGHUP more than once."""
     for names, kills in ((("land", "land"), False), (("interrupt", "interrupt"), True), (("land", "interrupt"), True)):
         world = VirtualTwin()
-        world.fly_until(State.FLY)
+        world.fly_until(FlightState.FLY)
 
         @contextlib.contextmanager
         def pressed(*given, names=names):
@@ -260,18 +260,18 @@ def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest
         assert (world.flight.interrupts > 1) is kills
 
 
-@pytest.mark.parametrize("state", [State.ARM, State.RAMP])
-def test_a_state_that_takes_too_long_is_a_fault(state: State) -> None:
+@pytest.mark.parametrize("state", [FlightState.ARM, FlightState.RAMP])
+def test_a_state_that_takes_too_long_is_a_fault(state: FlightState) -> None:
     after = Supervisor(state, 0.0).after([Fault(Event.TIMEOUT)], 1.0)
     assert after.cause is not None
-    assert Supervisor(State.FLY, 0.0).after([Fault(Event.TIMEOUT)], 1.0).cause is None
+    assert Supervisor(FlightState.FLY, 0.0).after([Fault(Event.TIMEOUT)], 1.0).cause is None
 
 
 def test_a_kill_in_a_dry_run_locks_no_drone() -> None:
     world = VirtualTwin(FlightSettings(dry_run=True))
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.flight.kill = True
-    world.fly_until(State.DONE)
+    world.fly_until(FlightState.DONE)
     assert packets.EMERGENCY_STOP not in [packet for link in world.links for _, packet in link.packets]
 
 
@@ -284,7 +284,7 @@ def test_a_kill_in_a_dry_run_locks_no_drone() -> None:
 def test_whatever_the_drones_report_no_command_leaves_its_bounds(raw: list[tuple[bytes, bytes]], paused: float) -> None:
     """A hostile pair that speaks the protocol well: states of any bytes in the middle of a flight."""
     world = VirtualTwin()
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(paused)
     before = [len(link.packets) for link in world.links]
     for pair_of_states in raw:

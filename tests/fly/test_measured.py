@@ -21,7 +21,7 @@ from mjxfly.measured import CONTRADICTING, REPEATING, WINDOW, DroneWatch, ImuWat
 from mjxfly.mocap_supervision import Frame as PoseFrame
 from mjxfly.mocap_supervision import Pose
 from mjxfly.packets import DroneState
-from mjxfly.supervisor import Event, State
+from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import Sample
 from mjxfly.twin.conditions import Surroundings
 from mjxfly.twin.virtual import VirtualTwin
@@ -209,7 +209,7 @@ def hovering(world: VirtualTwin, seconds: float) -> VirtualTwin:
     config, place = Controller(FLIGHT).config, [np.array([0.0, 0.0, 0.4]), np.zeros(3), np.zeros(3)]
     world.start_in_air(start_state(config, *place, np.float64(world.pair.conditions.object_mass), np.float64(0.0)))
     world.fly_for(seconds)
-    assert world.flight.supervisor.state is State.FLY
+    assert world.flight.supervisor.state is FlightState.FLY
     return world
 
 
@@ -220,7 +220,7 @@ def ended(world: VirtualTwin, limit: float) -> tuple[float, float, str, str]:
         world.tick()
         cause = world.flight.supervisor.cause
         if cause is not None:
-            assert world.flight.supervisor.state in (State.DESCEND, State.HOLD, State.STOP)
+            assert world.flight.supervisor.state in (FlightState.DESCEND, FlightState.HOLD, FlightState.STOP)
             moved = float(np.linalg.norm(world.moment().position - start))
             return world.now - began, moved, cause.event.name, cause.detail
     return math.inf, float(np.linalg.norm(world.moment().position - start)), "", ""
@@ -327,8 +327,8 @@ X_UP: Frame = lambda p, q: (p[[2, 1, 0]] * signs(-1, 1, 1), q[[0, 3, 2, 1]] * si
 def test_a_wrong_frame_of_motion_capture_ends_the_flight_low(name: str) -> None:
     world = CapturedTwin(FLIGHT, HOVER, mapped(X_UP if name == "x up" else FRAMES[name]), settle=0.5)
     assert world.refusal() == ""  # nothing that stands shows it
-    world.fly_until(State.DESCEND, 8.0)
-    world.fly_until(State.STOP, 6.0)
+    world.fly_until(FlightState.DESCEND, 8.0)
+    world.fly_until(FlightState.STOP, 6.0)
     cause = world.flight.supervisor.cause
     track = [(one.position, one.tilt) for one in world.track]
     height = max(place[2] for place, _ in track) - world.rest

@@ -30,7 +30,7 @@ from mjxfly.mocap import Mocap, MocapError, MocapSettings, ready
 from mjxfly.mocap_child import Decimation
 from mjxfly.mocap_supervision import Frame, MocapLimits, Pose
 from mjxfly.packets import Setpoint
-from mjxfly.supervisor import Event, State
+from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import Rig
 from mjxfly.twin.conditions import Surroundings
 
@@ -319,10 +319,10 @@ class Seen:
         """Fly to the end; the cause of an abort, empty if there was none."""
         spoil, self._spoil = self._spoil, lambda elapsed, frame: frame
         self.mocap.guarding = True
-        self.world.fly_until(State.FLY)
+        self.world.fly_until(FlightState.FLY)
         self.world.fly_for(1.0)
         self._spoil, self._begin = spoil, self.world.now
-        self.world.fly_until(State.DONE)
+        self.world.fly_until(FlightState.DONE)
         cause = self.world.flight.supervisor.cause
         return "" if cause is None else f"{cause.event.name} {cause.detail}"
 

@@ -22,7 +22,7 @@ from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
 from mjxfly.log import main as draw
 from mjxfly.recording import Recording, _tick_remarks, fly_again, read_recording
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
 from mjxfly.twin.physics import make_pair
 from mjxfly.view.main import main as view
@@ -39,7 +39,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         settings = FlightSettings(seconds=4.0, goal=(0.1, 0.0, 0.4))
         physics = make_pair(contents.card, OLDER, EXACT)
         world = VirtualTwin(settings, contents=contents, physics=physics, log=notes)
-        world.fly_until(State.DONE)
+        world.fly_until(FlightState.DONE)
     return path
 
 

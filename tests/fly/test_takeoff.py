@@ -15,7 +15,7 @@ from mjxball.policy.team import is_for_any
 from mjxfly.card import Controller, goal_of, limits_of, load_policy
 from mjxfly.limits import FlightSettings, Times
 from mjxfly.setpoints import CommandMap
-from mjxfly.supervisor import Event, State
+from mjxfly.supervisor import Event, FlightState
 from mjxfly.takeoff import BEGIN, MOST_LIFT, TakeOff
 from mjxfly.telemetry import ObjectState, Rig
 from mjxfly.twin import avionics
@@ -39,13 +39,13 @@ def world_of(name: str, seconds: float, ball: float = 0.0, **around) -> VirtualT
 def check_that_the_stand_keeps(ball: float, **around) -> None:
     """It comes off level and at once, and the ball stays off its stops for 3 s."""
     world = world_of("stand", 3.0, ball, **around)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     share, height = world.config.plant.moving_fraction, world.state.position[:, 2] - world.rest
     assert height.min() > 0.03  # both sides, of 0.04 m of O at which the laws take over
     # 4.4 mN m of the ball are half of what both drones' rotors alone can hold: level means less than a degree or so.
     assert max(abs(moment.roll) for moment in world.track) < math.radians(1.5)
     world.fly_for(2.9)
-    assert world.flight.supervisor.state is State.FLY
+    assert world.flight.supervisor.state is FlightState.FLY
     assert max(abs(moment.ball) for moment in world.track) / share < world.config.plant.ball_stop
 
 
@@ -74,9 +74,9 @@ def test_free_flights_begin_where_the_pair_stood(name: str, around: dict) -> Non
     much, where it alone is allowed 6.5 cm.
     """
     world = world_of(name, 5.0, **around)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.fly_for(4.9)
-    assert world.flight.supervisor.state is State.FLY
+    assert world.flight.supervisor.state is FlightState.FLY
     gone = np.array([moment.position for moment in world.track]) - [0.0, 0.0, world.rest]
     assert np.hypot(gone[:, 0], gone[:, 1]).max() < 0.15
     past = 0.065 if name == "universal" and around.get("noise", 0.0) > 1.0 else 0.05
@@ -90,7 +90,7 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
     """
     for gains in ((0.92, 1.08), (1.08, 0.92), (0.95, 1.05)):
         world = world_of("flight", 4.0, gains=gains, delay=0.005)
-        world.fly_until(State.FLY)
+        world.fly_until(FlightState.FLY)
         world.fly_for(2.5)
         gone = np.array([moment.position for moment in world.track])
         assert np.hypot(gone[:, 0], gone[:, 1]).max() < 0.06, gains
@@ -123,7 +123,7 @@ def test_a_policy_for_any_rig_is_told_that_it_flies_crazyflies() -> None:
 
 def test_the_laws_take_over_in_the_air_and_remember_nothing_of_the_ground() -> None:
     world = world_of("flight", 1.0)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     assert world.pair.data.ncon == 0  # no leg touches the floor
     # One period of at most 0.3 m of error, and what a level angle of a degree adds.
     assert np.abs(world.flight.controller.integral).max() < 0.02

@@ -11,7 +11,7 @@ from fly_virtual import VirtualTwin
 
 from mjxfly.flight import Flight
 from mjxfly.limits import FlightSettings, Times
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.warm_up import warm_up
 
 # Prints in which states a flight does what only comes once: without and with a warm-up. A process of its own: in this
@@ -70,7 +70,7 @@ def test_a_flight_does_nothing_for_the_first_time(tmp_path: Path) -> None:
 
 
 def test_a_warm_up_goes_through_every_state_and_leaves_nothing_behind() -> None:
-    seen: set[State] = set()
+    seen: set[FlightState] = set()
 
     class Noted(Flight):
         def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
@@ -81,7 +81,7 @@ def test_a_warm_up_goes_through_every_state_and_leaves_nothing_behind() -> None:
     flight, before = world.flight, [len(link.packets) for link in world.links]
     pair = (world.links, flight.controller, world.variants, ["linear"] * 2, world.rig, world.settings)
     warm_up(Noted, *pair, world.now)
-    assert seen == set(State)
+    assert seen == set(FlightState)
     assert [len(link.packets) for link in world.links] == before
     assert flight.controller.policy.memory is None
     assert not flight.controller.integral.any()

@@ -214,14 +214,14 @@ SPOILED = """
 import sys, time
 from mjxfly import flight
 from mjxfly.main import main
-from mjxfly.supervisor import Event, Fault, State
+from mjxfly.supervisor import Event, Fault, FlightState
 
-phase, how, advance = State(sys.argv[1]), sys.argv[2], flight.Flight._advance
-led = {State.DESCEND: Event.STICK, State.HOLD: Event.UNHEARD}
+phase, how, advance = FlightState(sys.argv[1]), sys.argv[2], flight.Flight._advance
+led = {FlightState.DESCEND: Event.STICK, FlightState.HOLD: Event.UNHEARD}
 
 def spoiled(self, faults):
     before = self.supervisor.state
-    if before is State.FLY and self.elapsed > 0.5 and phase in led:
+    if before is FlightState.FLY and self.elapsed > 0.5 and phase in led:
         faults = [*faults, Fault(led[phase])]
     advance(self, faults)
     if self.supervisor.state is phase is not before and self.watchdog is not None:

@@ -22,7 +22,7 @@ from mjxball.policy import Policy
 from mjxball.train.checkpoint import CHECKPOINTS
 from mjxball.train.population import grid
 from mjxball.train.processes import Rendezvous, join
-from mjxball.train.program import Program
+from mjxball.train.program import TrainingProgram
 
 REPOSITORY = Path(__file__).parents[2]
 SMALL = [
@@ -299,9 +299,9 @@ def test_the_only_gpu_that_a_process_sees_is_its_first(monkeypatch: pytest.Monke
 
 
 def test_sizes_that_cannot_be_split_are_refused(transport) -> None:
-    Program(transport, "newton-euler").algorithm.check_parts(4)
+    TrainingProgram(transport, "newton-euler").algorithm.check_parts(4)
     with pytest.raises(InputError, match=r"sac\.num_envs = 512"):
-        Program(transport, "newton-euler").algorithm.check_parts(3)
+        TrainingProgram(transport, "newton-euler").algorithm.check_parts(3)
 
 
 def test_meeting_flags_need_distributed(capsys: pytest.CaptureFixture) -> None:

@@ -25,7 +25,7 @@ from mjxball.train import program as programs
 from mjxball.train import train
 from mjxball.train.extensions import Extensions, find, make_env
 from mjxball.train.population import Population
-from mjxball.train.program import Program
+from mjxball.train.program import TrainingProgram
 from mjxball.train.stretch import advance
 
 SMALL = {
@@ -103,7 +103,7 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
 @pytest.mark.parametrize("name", ["sac", *weekly("ppo")])
 def test_an_episode_that_ends_early_has_its_own_return(name: str, small: Config) -> None:
     """An environment that earns 1 a step and ends after 7: not the 60 of an episode of the time limit."""
-    program = Program(small, "newton-euler", extensions=Extensions(toys.Brief, None, find(name, "--algorithm")))
+    program = TrainingProgram(small, "newton-euler", extensions=Extensions(toys.Brief, None, find(name, "--algorithm")))
     state = jax.jit(program.create)(jax.random.PRNGKey(0))
     state = state._replace(envs=program.evaluation_envs(jax.random.PRNGKey(0)))
     steps = program.evaluation_steps

@@ -12,7 +12,7 @@ from conftest import with_settings
 
 from mjxball import config as configs
 from mjxball.train import program as programs
-from mjxball.train.program import Program, TrainState
+from mjxball.train.program import TrainingProgram, TrainState
 
 pytestmark = pytest.mark.slow  # trainings
 WORLDS = 128
@@ -21,7 +21,7 @@ WORLDS = 128
 class Compiled(NamedTuple):
     """A program with its jitted functions."""
 
-    program: Program
+    program: TrainingProgram
     create: Any  # key -> TrainState
     advance: Any  # (TrainState, Mode) -> (TrainState, Statistics)
     fresh: Any  # key -> worlds
@@ -31,7 +31,7 @@ class Compiled(NamedTuple):
 def compiled(transport) -> Compiled:
     """The transport preset, shortened to 128 000 environment steps, on closed-form physics."""
     steps = 128_000
-    program = Program(
+    program = TrainingProgram(
         with_settings(
             transport, sac={"total_steps": steps, "replay_size": steps, "num_envs": WORLDS, "updates_per_step": 4}
         ),
@@ -60,7 +60,7 @@ def assert_identical(first: Any, second: Any) -> None:
 @pytest.mark.parametrize("name", configs.PRESETS)
 def test_a_training_state_has_no_array_without_elements(name: str) -> None:
     """Over several GPUs XLA's partitioner ends the process by a segfault on one."""
-    state = jax.eval_shape(Program(configs.preset(name), "newton-euler").create, jax.random.PRNGKey(0))
+    state = jax.eval_shape(TrainingProgram(configs.preset(name), "newton-euler").create, jax.random.PRNGKey(0))
     assert all(leaf.size for leaf in jax.tree.leaves(state))
 
 

@@ -20,7 +20,7 @@ from mjxball.train import program as programs
 from mjxball.train import requirements
 from mjxball.train.extensions import Extensions, find
 from mjxball.train.population import Population
-from mjxball.train.program import Program
+from mjxball.train.program import TrainingProgram
 from mjxball.train.requirements import PROGRAM, required
 from mjxball.xla import explained
 
@@ -82,7 +82,9 @@ def test_the_estimate_of_gradients_is_below_what_xla_takes() -> None:
     settings = configs.preset("transport")
     for path, value in (("policy_layers", (32, 32)), ("num_envs", 256), ("horizon", 20)):
         settings = configs.replace(settings, f"gradient.{path}", value)
-    program = Program(settings, "newton-euler", extensions=Extensions(algorithm=find("gradient", "--algorithm")))
+    program = TrainingProgram(
+        settings, "newton-euler", extensions=Extensions(algorithm=find("gradient", "--algorithm"))
+    )
     state = jax.eval_shape(program.create, jax.random.PRNGKey(0))
     compiled = jax.jit(program.advance).lower(state, programs.train(20)).compile()
     taken = compiled.memory_analysis()

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjxball import __version__
 from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
-from mjxball.control.followers import LARGEST
+from mjxball.control.followers import MAX_OBSERVATION
 from mjxball.control.geometry import GEOMETRY_SIZE
 from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
 from mjxball.errors import InputError
@@ -96,7 +96,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         size=size,
         widest=max(outputs) + law.units,
         most_inputs=most,
-        largest=_literal(LARGEST),
+        largest=_literal(MAX_OBSERVATION),
         int8="#define MJXBALL_INT8 1\n" if int8 else "",
         weights=", weights of 8 bits" if int8 else "",
         includes="#include <stdint.h>\n\n" if int8 else "",

@@ -17,7 +17,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from mjxball import __version__
 from mjxball.control import observation as layout
-from mjxball.control.followers import LARGEST
+from mjxball.control.followers import MAX_OBSERVATION
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.inference import NetworkLaw, Policy, known_geometry
 
@@ -163,7 +163,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     law = NetworkLaw(Policy(contents, "traced", np.float32))
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    sound = _is_below(LARGEST, observation)
+    sound = _is_below(MAX_OBSERVATION, observation)
     seen = _where(sound, observation, np.zeros(1))
     begun = memory = around.start(seen, known_geometry(contents.card, name))
     if around.size:

@@ -15,7 +15,7 @@ from tables import rows
 
 from mjxball.policy.file import law_of
 from mjxfly.app.host import App
-from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app.protocol import CAUSES, AppPhase
 from mjxfly.card import config_of, variants
 from mjxfly.telemetry import Rig
 
@@ -32,7 +32,7 @@ def taken_off(name: str = "flight") -> Bench:
     """A pair in the first period of its laws."""
     bench = Bench(cores_of(name), Rig.of_card(policy_of(name).card))
     bench.take_off()
-    assert bench.phases == [Phase.FLY] * 2
+    assert bench.phases == [AppPhase.FLY] * 2
     return bench
 
 
@@ -61,8 +61,8 @@ def refusal(app: App) -> str:
 
 
 @needs_gcc
-@rows("phase", [Phase.FLY, Phase.DESCEND])
-def test_parameters_that_cannot_be_leave_the_last_ones_in_use(phase: Phase):
+@rows("phase", [AppPhase.FLY, AppPhase.DESCEND])
+def test_parameters_that_cannot_be_leave_the_last_ones_in_use(phase: AppPhase):
     """Every period of a pair with one wild parameter is that of a pair without, in both roles."""
     spoilt: list[tuple[str, float, str]] = [
         (f"{what}{axis}", value, text) for what, text in AFTER.items() for axis in "XYZ" for value in WILD
@@ -87,24 +87,24 @@ def test_the_curve_that_spinning_motors_show_is_flown():
     """It comes in SPIN; every later period is that of a pair that had it before, up to the trim of a descent."""
     known, found = (Bench(cores_of(), taken_off().rig) for _ in range(2))
     for bench, before in ((known, True), (found, False)):
-        for phase, periods in ((Phase.IDLE, 3), (Phase.SPIN, 5)):
+        for phase, periods in ((AppPhase.IDLE, 3), (AppPhase.SPIN, 5)):
             for _ in range(periods):
                 bench.tick(phase)
-            for app in bench.apps if before is (phase is Phase.IDLE) else ():
+            for app in bench.apps if before is (phase is AppPhase.IDLE) else ():
                 app.set("curve", 1)
-        assert bench.phases == [Phase.SPIN] * 2
-    sent = [[numbers(bench.tick(Phase.RAMP)) for _ in range(150)] for bench in (known, found)]
+        assert bench.phases == [AppPhase.SPIN] * 2
+    sent = [[numbers(bench.tick(AppPhase.RAMP)) for _ in range(150)] for bench in (known, found)]
     hovers = [own["older"].map.hover_thrust for own in variants(config_of(policy_of("flight").card))]
     ramped = [10_001 + 0.8 * (hover - 10_001) for hover in hovers]  # 1.2 of 1.5 s
     np.testing.assert_allclose([thrust for _, _, thrust in sent[1][120]], ramped, rtol=0.01)
     assert sent[1] == sent[0]
-    assert [numbers(found.tick(Phase.DESCEND)) for _ in range(5)] == [
-        numbers(known.tick(Phase.DESCEND)) for _ in range(5)
+    assert [numbers(found.tick(AppPhase.DESCEND)) for _ in range(5)] == [
+        numbers(known.tick(AppPhase.DESCEND)) for _ in range(5)
     ]
     assert [refusal(app) for app in found.apps] == [CAUSES[0]] * 2
     late = flying()
     late.apps[0].set("curve", 1)
-    late.tick(Phase.FLY)
+    late.tick(AppPhase.FLY)
     assert refusal(late.apps[0]) == IN_FLIGHT
 
 
@@ -113,8 +113,8 @@ def test_a_goal_can_change_in_flight():
     bench, calm = flying(), flying()
     for app in bench.apps:
         app.set("goalZ", 0.2)
-    assert numbers(bench.tick(Phase.FLY)) != numbers(calm.tick(Phase.FLY))
-    assert bench.phases == [Phase.FLY] * 2
+    assert numbers(bench.tick(AppPhase.FLY)) != numbers(calm.tick(AppPhase.FLY))
+    assert bench.phases == [AppPhase.FLY] * 2
 
 
 @needs_gcc
@@ -126,15 +126,15 @@ def test_states_that_cannot_be_end_in_a_descent():
                 bench = flying()
                 wrong = [0.01] * size if name != "quaternion" else [1.0, 0.0, 0.0, 0.0]
                 wrong[slot] = value
-                sent = [bench.tick(Phase.FLY, **{name: wrong}) for _ in range(12)]
+                sent = [bench.tick(AppPhase.FLY, **{name: wrong}) for _ in range(12)]
                 for one in sent:
                     assert_within_limits(one)
-                assert bench.phases == [Phase.DESCEND] * 2, (name, value)
+                assert bench.phases == [AppPhase.DESCEND] * 2, (name, value)
                 assert bench.cause(0) == OLD
     for value in WILD:  # of a battery's voltage: as good as none
         bench = flying()
         for _ in range(520):
-            bench.tick(Phase.FLY, HIGH, voltage=value)
+            bench.tick(AppPhase.FLY, HIGH, voltage=value)
         assert bench.cause(0) == "the battery is low", value
 
 
@@ -171,16 +171,16 @@ def test_heartbeats_that_cannot_be_are_not_heard():
         bench = flying()
         for number in range(40):
             if number == 25:
-                assert bench.phases == [Phase.FLY] * 2, what
+                assert bench.phases == [AppPhase.FLY] * 2, what
             beats = [bytearray(app.send()) for app in bench.apps[::-1]]
             spoil(beats[1])
             bench.now += bench.apps[0].period
             for app, beat, mount in zip(bench.apps, beats, bench.rig.mounts, strict=True):
                 app.hear(bytes(beat), bench.now)
-                app.laptop(bytes([1, Phase.FLY]), bench.now)
+                app.laptop(bytes([1, AppPhase.FLY]), bench.now)
                 assert_within_limits([app.tick(bench.state(AT_REST, mount), bench.now)])
         assert bench.cause(1) == "the other drone is not heard", what
-        assert bench.phases == [Phase.LAND] * 2
+        assert bench.phases == [AppPhase.LAND] * 2
 
 
 @needs_gcc
@@ -188,21 +188,21 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
     """Its own numbers are spoilt, which no input can do: level at once, sinking, and the other one is told."""
     level = flying()
     for _ in range(2):
-        calm = level.tick(Phase.FLY)
+        calm = level.tick(AppPhase.FLY)
     for value in (math.nan, math.inf):
         for slot in range(3):
             bench = flying()
             leader = bench.apps[0]
-            bench.tick(Phase.FLY)
+            bench.tick(AppPhase.FLY)
             leader._c.integral(leader._core)[slot] = value
-            sent = bench.tick(Phase.FLY)
+            sent = bench.tick(AppPhase.FLY)
             assert_within_limits(sent)
-            assert leader.phase is Phase.DESCEND
+            assert leader.phase is AppPhase.DESCEND
             assert bench.cause(0) == "the command is not finite"
             assert (sent[0].roll, sent[0].pitch) == (0.0, 0.0)
             assert 0.7 * calm[0].thrust < sent[0].thrust < calm[0].thrust
-            assert_within_limits(bench.tick(Phase.FLY))
-            assert bench.phases == [Phase.DESCEND] * 2
+            assert_within_limits(bench.tick(AppPhase.FLY))
+            assert bench.phases == [AppPhase.DESCEND] * 2
 
 
 @needs_gcc
@@ -216,13 +216,13 @@ def test_a_state_of_the_network_that_is_not_finite_lands_the_pair(name: str):
         memory = app._c.memory(app._core)
         assert np.isfinite(memory[:size]).all()
         memory[3 + 7] = value  # behind the last action
-        assert_within_limits(bench.tick(Phase.FLY))
-        assert app.phase is Phase.LAND
+        assert_within_limits(bench.tick(AppPhase.FLY))
+        assert app.phase is AppPhase.LAND
         assert app.logged()["copying"] == 1
         assert bench.cause(1) == "the command is not finite"
         for _ in range(10):
-            assert_within_limits(bench.tick(Phase.FLY, HIGH))
-        assert bench.phases == [Phase.LAND] * 2
+            assert_within_limits(bench.tick(AppPhase.FLY, HIGH))
+        assert bench.phases == [AppPhase.LAND] * 2
 
 
 @needs_gcc
@@ -233,9 +233,9 @@ def test_the_leaders_integral_is_bounded():
     for slot in range(3):
         leader._c.integral(leader._core)[slot] = 1000.0
     for _ in range(5):
-        bench.tick(Phase.FLY)
+        bench.tick(AppPhase.FLY)
     assert max(leader.integral[:3]) <= 1000.0
-    assert bench.phases == [Phase.FLY] * 2
+    assert bench.phases == [AppPhase.FLY] * 2
 
 
 @needs_gcc

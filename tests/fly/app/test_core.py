@@ -15,7 +15,7 @@ from mjxball.policy import Policy
 from mjxball.sim.laws import Laws
 from mjxfly.app import generate, protocol
 from mjxfly.app.host import App
-from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app.protocol import CAUSES, AppPhase
 from mjxfly.card import Controller
 from mjxfly.telemetry import ObjectState, Rig
 
@@ -42,11 +42,11 @@ def test_the_apps_command_what_the_laptop_would(name: str):
         if not free:
             moving[0][:2] = moving[1][:2] = moving[2][1:] = moving[3][1:] = 0.0
         pair = ObjectState(moving[0], moving[1], rotations.quaternion_from_euler(moving[2]), moving[3])
-        bench.tick(Phase.FLY, pair)
+        bench.tick(AppPhase.FLY, pair)
         wanted = controller.step(pair, goal)
         both = np.concatenate([wanted.leader, wanted.follower])
         found = np.concatenate([app.command for app in bench.apps])
-        if bench.phases != [Phase.FLY] * 2:
+        if bench.phases != [AppPhase.FLY] * 2:
             break
         worst, spread = np.maximum(worst, abs(found - both)), np.maximum(spread, abs(both))
     assert number > 50
@@ -78,13 +78,13 @@ def test_a_flight_begins_with_an_empty_state(name: str):
     flights: list[list[Any]] = []
     for _ in range(2):
         bench.take_off()
-        flights.append([(one.roll, one.pitch, one.thrust) for _ in range(30) for one in bench.tick(Phase.FLY)])
+        flights.append([(one.roll, one.pitch, one.thrust) for _ in range(30) for one in bench.tick(AppPhase.FLY)])
         for _ in range(40):
-            bench.tick(Phase.FLY, AT_REST._replace(velocity=np.array([0.3, -0.2, 0.1])))
-        while bench.phases != [Phase.IDLE] * 2:
-            bench.tick(Phase.STOP if bench.apps[0].phase is not Phase.STOP else Phase.IDLE)
+            bench.tick(AppPhase.FLY, AT_REST._replace(velocity=np.array([0.3, -0.2, 0.1])))
+        while bench.phases != [AppPhase.IDLE] * 2:
+            bench.tick(AppPhase.STOP if bench.apps[0].phase is not AppPhase.STOP else AppPhase.IDLE)
         for app in bench.apps:
-            app.laptop(protocol.order(Phase.IDLE).data, bench.now)
+            app.laptop(protocol.order(AppPhase.IDLE).data, bench.now)
     assert flights[1] == flights[0]
     assert len(set(flights[0])) > 30
 
@@ -103,11 +103,11 @@ def test_an_app_refuses_to_start():
     rig = Rig.of_card(policy_of("flight").card)
     for text, spoil in REFUSED:
         bench = Bench(cores_of(), rig)
-        bench.tick(Phase.IDLE)
+        bench.tick(AppPhase.IDLE)
         spoil(bench)
         for _ in range(5):
-            sent = bench.tick(Phase.SPIN)
-        assert bench.apps[0].phase is Phase.IDLE, text
+            sent = bench.tick(AppPhase.SPIN)
+        assert bench.apps[0].phase is AppPhase.IDLE, text
         assert CAUSES[int(bench.apps[0].logged()["refusal"])] == text
         assert not sent[0].active
     bench = Bench(cores_of(), rig)
@@ -119,13 +119,13 @@ def test_an_app_refuses_to_start():
         ({"variance": [0.0] * 3}, "the estimator's position cannot be trusted"),  # it does not run
     ):
         for _ in range(3):
-            bench.tick(Phase.SPIN, **wrong)
+            bench.tick(AppPhase.SPIN, **wrong)
         assert CAUSES[int(bench.apps[0].logged()["refusal"])] == text
     alone = App(cores_of()[1], 1)
     alone.set("mountY", -0.15)
-    alone.laptop(protocol.order(Phase.SPIN).data, 1000)
+    alone.laptop(protocol.order(AppPhase.SPIN).data, 1000)
     alone.tick(bench.state(AT_REST, np.zeros(3)), bench.now)
-    assert alone.phase is Phase.IDLE
+    assert alone.phase is AppPhase.IDLE
 
 
 @needs_gcc
@@ -133,44 +133,44 @@ def test_one_abort_lands_both():
     """Whatever the leader finds moves the follower within two periods, and the other way round for silence."""
     rig = Rig.of_card(policy_of("flight").card)
     for wrong, phase, text in (
-        ({"position": [5.0, 0.15, 0.0]}, Phase.DESCEND, "beyond the fence"),
-        ({"position": [float("inf"), 0.0, 0.0]}, Phase.DESCEND, "the state is old or not finite"),
-        ({"variance": [1.0, 0.0, 0.0]}, Phase.DESCEND, "the estimator's position cannot be trusted"),
-        ({"quaternion": [0.9, 0.4359, 0.0, 0.0]}, Phase.STOP, "tilted beyond the limit"),
-        ({"can_fly": False}, Phase.STOP, "the firmware cannot fly"),
+        ({"position": [5.0, 0.15, 0.0]}, AppPhase.DESCEND, "beyond the fence"),
+        ({"position": [float("inf"), 0.0, 0.0]}, AppPhase.DESCEND, "the state is old or not finite"),
+        ({"variance": [1.0, 0.0, 0.0]}, AppPhase.DESCEND, "the estimator's position cannot be trusted"),
+        ({"quaternion": [0.9, 0.4359, 0.0, 0.0]}, AppPhase.STOP, "tilted beyond the limit"),
+        ({"can_fly": False}, AppPhase.STOP, "the firmware cannot fly"),
     ):
         bench = Bench(cores_of(), rig)
         bench.take_off()
-        assert bench.phases == [Phase.FLY] * 2
-        bench.tick(Phase.FLY, **wrong)
-        sent = bench.tick(Phase.FLY, **wrong)
+        assert bench.phases == [AppPhase.FLY] * 2
+        bench.tick(AppPhase.FLY, **wrong)
+        sent = bench.tick(AppPhase.FLY, **wrong)
         assert bench.phases == [phase] * 2, text
         assert (bench.cause(0), bench.cause(1)) == (text, "the other drone does")
         assert all(np.isfinite([one.roll, one.pitch, one.thrust]).all() for one in sent)
-        assert all((one.thrust == 0) == (phase is Phase.STOP) for one in sent)
+        assert all((one.thrust == 0) == (phase is AppPhase.STOP) for one in sent)
     bench = Bench(cores_of(), rig)
     bench.take_off()
     high = AT_REST._replace(position=np.array([0.0, 0.0, 0.3]))
     for _ in range(40):
-        bench.tick(Phase.LAND, high)
-    bench.tick(Phase.LAND, high, variance=[1.0] * 3)  # nothing is known of the ground
-    assert bench.phases[0] is Phase.DESCEND
+        bench.tick(AppPhase.LAND, high)
+    bench.tick(AppPhase.LAND, high, variance=[1.0] * 3)  # nothing is known of the ground
+    assert bench.phases[0] is AppPhase.DESCEND
     bench = Bench(cores_of(), rig)
     bench.take_off()
     for _ in range(52):
         bench.tick(None)
-    assert bench.phases == [Phase.LAND] * 2
+    assert bench.phases == [AppPhase.LAND] * 2
     assert "the laptop is not heard" in (bench.cause(0), bench.cause(1))
 
 
 @needs_gcc
 def test_nobody_lands_who_has_not_flown():
     """An order to land stops motors that spin; on a ramp it ends in the descent, which needs no law."""
-    for periods, phase in ((3, Phase.STOP), (50, Phase.DESCEND)):
+    for periods, phase in ((3, AppPhase.STOP), (50, AppPhase.DESCEND)):
         bench = Bench(cores_of(), Rig.of_card(policy_of("flight").card))
         for number in range(periods):
-            bench.tick(Phase.IDLE if number == 0 else Phase.SPIN if number < 3 else Phase.RAMP)
-        bench.tick(Phase.LAND)
+            bench.tick(AppPhase.IDLE if number == 0 else AppPhase.SPIN if number < 3 else AppPhase.RAMP)
+        bench.tick(AppPhase.LAND)
         assert bench.phases == [phase] * 2
 
 
@@ -179,7 +179,7 @@ def test_another_pair_on_the_channel_is_not_obeyed():
     """In flight a leader of another policy is not heard; on the ground it is a reason not to start."""
     rig = Rig.of_card(policy_of("flight").card)
 
-    def heard(bench: Bench, phase: Phase, order: Phase, ours: bool) -> App:
+    def heard(bench: Bench, phase: AppPhase, order: AppPhase, ours: bool) -> App:
         """The follower after a beat of the leader's in this phase."""
         beat, follower = bytearray(bench.apps[0].send()), bench.apps[1]
         beat[2] = phase
@@ -189,16 +189,16 @@ def test_another_pair_on_the_channel_is_not_obeyed():
         follower.tick(bench.state(AT_REST, rig.mounts[1]), bench.now)
         return follower
 
-    for ours, phase in ((False, Phase.FLY), (True, Phase.DESCEND)):
+    for ours, phase in ((False, AppPhase.FLY), (True, AppPhase.DESCEND)):
         bench = Bench(cores_of(), rig)
         bench.take_off()
-        assert heard(bench, Phase.DESCEND, Phase.FLY, ours).phase is phase
+        assert heard(bench, AppPhase.DESCEND, AppPhase.FLY, ours).phase is phase
     for ours, refusal in ((False, "the other drone flies another policy"), (True, "good")):
         bench = Bench(cores_of(), rig)
-        bench.tick(Phase.IDLE)
-        follower = heard(bench, Phase.IDLE, Phase.SPIN, ours)
+        bench.tick(AppPhase.IDLE)
+        follower = heard(bench, AppPhase.IDLE, AppPhase.SPIN, ours)
         assert CAUSES[int(follower.logged()["refusal"])] == refusal
-        assert follower.phase is (Phase.SPIN if ours else Phase.IDLE)
+        assert follower.phase is (AppPhase.SPIN if ours else AppPhase.IDLE)
 
 
 def test_names_are_those_of_the_c_files():

@@ -19,7 +19,7 @@ from mjxball.control import rotations
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxfly.app import generate, protocol
 from mjxfly.app.main import main as make_app
-from mjxfly.app.protocol import Phase
+from mjxfly.app.protocol import AppPhase
 from mjxfly.telemetry import ObjectState, Rig
 
 needs_arm = pytest.mark.skipif(bool(benchmark.missing()), reason=f"not installed: {benchmark.missing()}")
@@ -120,7 +120,11 @@ def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
     records: list[list[bytes]] = [[], []]
     place, euler, seen = np.zeros(3), np.zeros(3), set()
     for step in range(900):
-        order = (Phase.IDLE, Phase.SPIN, Phase.RAMP, Phase.FLY)[min(step // 20, 3)] if step < 700 else Phase.LAND
+        order = (
+            (AppPhase.IDLE, AppPhase.SPIN, AppPhase.RAMP, AppPhase.FLY)[min(step // 20, 3)]
+            if step < 700
+            else AppPhase.LAND
+        )
         place = place + random.normal(scale=0.002, size=3) if step > 200 else place
         euler = 0.98 * euler + random.normal(scale=0.004, size=3)
         far = np.array([0.0, 0.0, 0.0 if step < 60 else 0.4 if step < 800 else 2.0])  # at its goal, then outside
@@ -131,7 +135,7 @@ def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
             state = bytes(bench.state(moving, mount))
             records[number].append(state + beats[number] + np.array([bench.now, order], np.uint32).tobytes())
         seen |= set(bench.phases)
-    assert seen >= {Phase.SPIN, Phase.RAMP, Phase.FLY, Phase.LAND, Phase.DESCEND}
+    assert seen >= {AppPhase.SPIN, AppPhase.RAMP, AppPhase.FLY, AppPhase.LAND, AppPhase.DESCEND}
     for path, text in generate.files_of(policy, name, False).items():
         if path != "src/glue.c" and path.startswith("src/"):
             (tmp_path / Path(path).name).write_text(text)

@@ -15,9 +15,9 @@ from fly_faults_virtual import SETTLE, cause_of, code_of, settings_of
 from mjxball.control import rotations
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from mjxfly.app.protocol import Phase
+from mjxfly.app.protocol import AppPhase
 from mjxfly.card import Controller
-from mjxfly.supervisor import State as Laptop
+from mjxfly.supervisor import FlightState as Laptop
 from mjxfly.twin import avionics
 from mjxfly.twin.conditions import FAULT_KINDS, Conditions, Surroundings, drone_kind
 from mjxfly.twin.virtual import VirtualTwin
@@ -56,7 +56,7 @@ def test_the_apps_land_without_a_laptop():
         twin.track.append(twin.moment())
     assert twin.running() == [False, False]
     assert twin.touchdown_speed() < 0.4
-    assert [drone.app.phase for drone in twin.drones if drone.app] == [Phase.IDLE] * 2
+    assert [drone.app.phase for drone in twin.drones if drone.app] == [AppPhase.IDLE] * 2
     assert not any(drone.firmware.locked for drone in twin.drones)
 
 

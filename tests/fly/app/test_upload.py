@@ -22,7 +22,7 @@ from mjxball.policy.quantize import balanced, quantized
 from mjxfly.app import generate, protocol
 from mjxfly.app.host import App, compile_pair
 from mjxfly.app.main import main as make_app
-from mjxfly.app.protocol import CAUSES, Phase
+from mjxfly.app.protocol import CAUSES, AppPhase
 from mjxfly.app_flight import Apps, send_weights
 from mjxfly.connection import LinkError
 from mjxfly.limits import NAMES
@@ -92,10 +92,10 @@ def test_weights_are_uploaded_on_the_ground_only(name: str):
     assert upload([*packets[:5], *packets[3:]]) == 0  # repeated ones do no harm
     assert follower.ident == generate.ident_of(other, True)
     bench.take_off()
-    flown = [bench.tick(Phase.FLY)[1] for _ in range(3)]
+    flown = [bench.tick(AppPhase.FLY)[1] for _ in range(3)]
     new = Bench(compile_pair(other, name, int8=True), bench.rig)
     new.take_off()
-    assert [one.thrust for one in flown] == [new.tick(Phase.FLY)[1].thrust for _ in range(3)]
+    assert [one.thrust for one in flown] == [new.tick(AppPhase.FLY)[1].thrust for _ in range(3)]
     assert upload(protocol.upload(data, key)) == CAUSES.index(
         "refused: weights, mount and curve change on the ground only"
     )

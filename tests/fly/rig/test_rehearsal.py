@@ -28,7 +28,7 @@ from mjxfly.rig import identify as command
 from mjxfly.rig.fit import Estimate, identify
 from mjxfly.rig.log import Log, read_log
 from mjxfly.setpoints import CurveName
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin import conditions as kinds
 from mjxfly.twin.conditions import Conditions
 from mjxfly.twin.coupled import CoupledPair
@@ -76,12 +76,12 @@ def rehearse(path: Path, case: Case) -> None:
     settings, random = FlightSettings(seconds=case.seconds), np.random.default_rng(3)
     with Journal(path, **log_header(CONTENTS, "flight")) as journal:
         world = VirtualTwin(settings, contents=CONTENTS, physics=pair, log=journal)
-        world.fly_until(State.FLY)
-        while case.goals and world.flight.supervisor.state is State.FLY:
+        world.fly_until(FlightState.FLY)
+        while case.goals and world.flight.supervisor.state is FlightState.FLY:
             goal = np.array(settings.goal) + random.uniform(-1, 1, 3) * REACH
             world.flight.settings = dataclasses.replace(settings, goal=(float(goal[0]), float(goal[1]), float(goal[2])))
             world.fly_for(1.0)
-        world.fly_until(State.DONE)
+        world.fly_until(FlightState.DONE)
         assert world.flight.supervisor.cause is None
         assert world.flight.spin.curves == [case.curve] * 2
         journal.note("end", code=0)

@@ -12,7 +12,7 @@ from twin_peer import ask, written
 from mjxfly import packets
 from mjxfly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
 from mjxfly.twin import logs
-from mjxfly.twin.arming import PERIOD, Phase
+from mjxfly.twin.arming import PERIOD, ArmingPhase
 from mjxfly.twin.conditions import (
     DELIVERED,
     DRONES,
@@ -104,7 +104,7 @@ def test_row_flying_from_the_first_motor_until_two_seconds_after_the_last() -> N
     bench.run(2.5)
     # 2 s after the last look that saw a motor turn, at the next look.
     assert 2.0 - PERIOD <= bench.since(FLYING, stopped, wanted=False) <= 2.0 + 2 * PERIOD
-    assert bench.firmware.supervisor.phase is Phase.LANDED
+    assert bench.firmware.supervisor.phase is ArmingPhase.LANDED
     assert not bench.firmware.info & LOCKED
     bench.run(4.0)  # landed for 3 s: it starts over, and a 2.1 arms itself again
     infos = [info for now, info, _ in bench.seen if now > stopped + 2.2]
@@ -150,7 +150,7 @@ def test_row_setpoints_that_come_back_end_the_warning() -> None:
     bench = Bench().fly()
     bench.sent = None
     bench.run(1.5)
-    assert bench.firmware.supervisor.phase is Phase.LEVEL_OUT
+    assert bench.firmware.supervisor.phase is ArmingPhase.LEVEL_OUT
     bench.sent = HIGH
     assert bench.run(0.2).setpoint == HIGH
 

@@ -14,7 +14,7 @@ from mjxball.policy import Policy
 from mjxfly import packets
 from mjxfly.card import Controller, goal_of, variants
 from mjxfly.limits import FlightSettings
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
 from mjxfly.twin.virtual import VirtualTwin
 
@@ -70,7 +70,7 @@ def test_two_flights_of_the_same_drones_and_how_they_touch_down() -> None:
 def test_a_pair_that_locked_itself_is_refused() -> None:
     policy = policy_of("flight")
     world = VirtualTwin(policy, settings_of(policy, 1.0), kind=drone_kind(curve="older"), settle=0.5, checks=True)
-    world.fly_until(State.FLY)
+    world.fly_until(FlightState.FLY)
     world.advance(4.0)  # the laptop is silent
     assert all(drone.firmware.locked for drone in world.drones)
     world.next_flight(pause=0.0, settle=0.5)
@@ -98,7 +98,7 @@ def test_a_stand_that_starts_in_the_air_with_its_ball_anywhere() -> None:
     vectors = ([0.0, 0.0, 0.08], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     mass = np.float64(conditions.object_mass)
     world.start_in_air(start_state(config, *map(np.array, vectors), mass, np.float64(-0.03)))
-    assert world.flight.supervisor.state is State.FLY
+    assert world.flight.supervisor.state is FlightState.FLY
     world.fly_for(0.05)
     np.testing.assert_allclose([moment.position[2] for moment in world.track], 0.08, atol=5e-3)
     assert world.track[0].ball == pytest.approx(-0.03 * config.plant.moving_fraction, abs=2e-3)

@@ -29,7 +29,7 @@ from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
 from mjxfly.main import main as fly
 from mjxfly.recording import read_recording
-from mjxfly.supervisor import State
+from mjxfly.supervisor import FlightState
 from mjxfly.twin.physics import make_pair
 from mjxfly.view.live import LiveView, Server
 from mjxfly.view.live_log import COLUMNS, STEP, LiveLog, columns
@@ -46,7 +46,7 @@ def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
         world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.card), log=notes)
-        world.fly_until(State.DONE)
+        world.fly_until(FlightState.DONE)
         notes.note("end", code=0)
     return path.read_bytes().splitlines(keepends=True)
 
