@@ -9,14 +9,14 @@ import jax
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Follower, Law
+from mjxball.control.followers import Baseline, Controller, Follower
 from mjxball.errors import InputError
 from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_control_step
 from mjxball.policy import Policy
-from mjxball.policy.inference import NetworkLaw
+from mjxball.policy.inference import NetworkController
 from mjxball.scalar_form import scalar_form
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays
@@ -29,13 +29,13 @@ def fly_compiled(
     follower: Follower,
     scenarios: Sequence[Scenario],
     physics: str = "newton-euler",
-    law: Law | None = None,
+    controller: Controller | None = None,
 ) -> list[Metrics]:
     """Metrics of every flight, computed in float32; `law` in place of the follower's own.
 
     Delays, biases and resolutions are constants of the program, everything else is given to it.
     """
-    controller, config_of = law or law_of(follower), (config.plant, config.attitude)
+    controller, config_of = controller or controller_of(follower), (config.plant, config.attitude)
     if physics not in TRAINING_ENGINES:
         raise InputError(f"batches fly on {' or '.join(TRAINING_ENGINES)}, not on {physics}")
     flown = scenario_arrays(config, scenarios)
@@ -65,10 +65,10 @@ def fly_compiled(
     return metrics.results(jax.jit(fly)(*single))
 
 
-def law_of(follower: Follower) -> Law:
+def controller_of(follower: Follower) -> Controller:
     """The pure functions of a follower; raise InputError if it has none."""
     if isinstance(follower, Baseline):
-        return follower.law
+        return follower.controller
     if isinstance(follower, Policy):
-        return NetworkLaw(follower)
+        return NetworkController(follower)
     raise InputError(f"follower {follower.name!r} is no baseline and no policy; batches cannot fly it")

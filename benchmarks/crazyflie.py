@@ -29,7 +29,7 @@ from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.env import TransportEnv
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy.file import shipped_policy
-from mjxball.policy.inference import NetworkLaw, Policy
+from mjxball.policy.inference import NetworkController, Policy
 from mjxball.sim.rollout import make_privileged_info, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
@@ -86,15 +86,15 @@ def fly_rigs(env: TransportEnv, starts: Any, follower: Follower) -> tuple[np.nda
     """e_o (T, n, 3) [m], tilt [rad] and divergence (T, n) of `follower` in the worlds that begin as `starts`."""
     privileged = jax.vmap(make_privileged_info(env.config))
     policy = isinstance(follower, Policy)
-    law = NetworkLaw(follower) if policy else follower.law
+    controller = NetworkController(follower) if policy else follower.controller
 
     def step(carried: Any, _: Any) -> Any:
         state, memory = carried
         world, seen = state.pipeline_state, state.obs[:, :OBSERVATION_SIZE]
         if policy:
-            state = jax.vmap(env.step)(state, law.answer(world.history, seen)[0])
+            state = jax.vmap(env.step)(state, controller.answer(world.history, seen)[0])
         else:
-            memory, command = law.step(memory, seen, privileged(world.plant, world.load))
+            memory, command = controller.step(memory, seen, privileged(world.plant, world.load))
             state = jax.vmap(env.step_with_command)(state, command)
         plant = state.pipeline_state.plant
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
@@ -102,7 +102,7 @@ def fly_rigs(env: TransportEnv, starts: Any, follower: Follower) -> tuple[np.nda
         return (state, memory), (world.goal - plant.position, tilt, state.metrics["diverged"])
 
     def fly() -> Any:
-        memory = () if policy else law.start(starts.obs[:, :OBSERVATION_SIZE])
+        memory = () if policy else controller.start(starts.obs[:, :OBSERVATION_SIZE])
         return jax.lax.scan(step, (starts, memory), None, length=round(SECONDS / env.dt))[1]
 
     return tuple(map(np.asarray, jax.jit(fly)()))

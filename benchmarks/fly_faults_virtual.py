@@ -30,12 +30,12 @@ from mjxball.cli import run_command
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
 from mjxfly.app.host import Library, compile_pair
-from mjxfly.card import Controller, goal_of, limits_of, times_of
 from mjxfly.figures import SETTLING
 from mjxfly.limits import FlightSettings
+from mjxfly.policy_setup import FlightController, goal_of, limits_of, times_of
 from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
-from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
+from virtual_twin import MemoryLog, TrueState, VirtualTwin
 
 SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
 SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
@@ -132,7 +132,7 @@ FAULTS: dict[str, Injection] = {
 
 def settings_of(policy: Policy, seconds: float) -> FlightSettings:
     """What the command line would make of `policy`'s card."""
-    config = Controller(policy).config
+    config = FlightController(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
     return FlightSettings(seconds, goal, stand=stand, limits=limits_of(config, goal), times=times_of(config))
 
@@ -186,7 +186,7 @@ def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
     world = VirtualTwin(
         policy,
         settings_of(policy, HOVER),
-        kind=drone_kind(Controller(policy).config.autopilot.drone.removesuffix("-legacy") or "2.1", "linear"),
+        kind=drone_kind(FlightController(policy).config.autopilot.drone.removesuffix("-legacy") or "2.1", "linear"),
         surroundings=Surroundings(seed=number),
         log=MemoryLog(True),
         settle=SETTLE,
@@ -264,7 +264,7 @@ def _send(end: Any, *arguments: Any) -> None:
     end.send(finish(*arguments))
 
 
-def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
+def evaluated(world: VirtualTwin, after: Sequence[TrueState], at: float) -> Row:
     """What became of a flight after its fault at `at` [s]."""
     running = np.array([moment.pwm.max(axis=1) > 0 for moment in after])
     off = [float(after[int(np.nonzero(one)[0][-1])].time - at) if one.any() else 0.0 for one in running.T]

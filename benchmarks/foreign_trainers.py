@@ -25,7 +25,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
-from importlib import metadata
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from mjxball.algorithms.base import PolicyNetwork
 from mjxball.env import TransportEnv
 from mjxball.policy import load_network, save_file
 from mjxball.policy.export import policy_file
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 from mjxball.xla import enable_compilation_cache
 from training import NO_CACHE, evaluate, launch, until_policy
 
@@ -337,14 +337,14 @@ def main() -> None:
     settings = {name: getattr(options, name) for name in SETTINGS[options.trainer]}
     options.sizes = [int(size) for size in options.layers.split(",")]
     library = LIBRARIES[options.trainer.partition("-")[0]]
-    card = {"trainer": options.trainer, "library": f"{library} {metadata.version(library)}", "settings": settings}
-    card |= {"seed": options.seed, "physics": options.physics}
+    metadata = {"trainer": options.trainer, "library": f"{library} {version(library)}", "settings": settings}
+    metadata |= {"seed": options.seed, "physics": options.physics}
     started = time.perf_counter()
 
     def export(steps: int, found: Any, mean: Any, deviation: Any) -> None:
         mask = jnp.asarray(TransportEnv(config, options.physics).input_mask)
         learnt = PolicyNetwork(found, jnp.asarray(mean), jnp.asarray(deviation), mask)
-        exported = policy_file(config, follower_law(config), learnt, steps, card)
+        exported = policy_file(config, follower_controller(config), learnt, steps, metadata)
         if library == "brax":
             save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
         if steps >= options.steps:

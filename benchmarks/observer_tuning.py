@@ -109,13 +109,13 @@ def medians(runs: Sequence[Metrics], sets: int) -> dict[str, np.ndarray]:
 
 
 def costs_of(
-    law: Any, drawn: list[Scenario], sets: int, allowed: float | None
+    controller: Any, drawn: list[Scenario], sets: int, allowed: float | None
 ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """(cost (S,), medians (S,) under each condition) of `law`, which flies all `drawn` with each of `sets`."""
     config = preset("paper")
     total, shown = np.zeros(sets), []
     flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn * sets]
-    flown = fly_compiled(config, Baseline(law, config), flights)
+    flown = fly_compiled(config, Baseline(controller, config), flights)
     for runs in (flown[: len(flights) // 2], flown[len(flights) // 2 :]):
         total += cost_of(runs, allowed).reshape(sets, -1).mean(axis=1)
         shown.append(medians(runs, sets))
@@ -137,8 +137,12 @@ def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarr
     runs: tuple[list[list[Metrics]], ...] = tuple([[] for _ in sets] for _ in CONDITIONS)
     for config, drawn in of_teams():
         flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn]
-        laws = [type("Tuned", (Mpc,), {"team_tuning": tuned(Mpc.team_tuning, values)})(config) for values in sets]
-        _, measured = fly_and_measure(config, [(Baseline(law, config), flights) for law in laws], "newton-euler")
+        controllers = [
+            type("Tuned", (Mpc,), {"team_tuning": tuned(Mpc.team_tuning, values)})(config) for values in sets
+        ]
+        _, measured = fly_and_measure(
+            config, [(Baseline(controller, config), flights) for controller in controllers], "newton-euler"
+        )
         found = iter(measured)
         for number in range(len(sets)):
             for of_condition in runs:
@@ -147,20 +151,20 @@ def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarr
     return np.asarray(total), [medians([*itertools.chain(*one)], len(sets)) for one in runs]
 
 
-def costs(law: Any, sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+def costs(controller: Any, sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """`costs_of` all `sets` (S, k) of gains of `observer` or `pid`, flown at once."""
-    config, allowed = preset("paper"), ALLOWED.get(law.name)
+    config, allowed = preset("paper"), ALLOWED.get(controller.name)
     drawn = from_rest(config) if allowed is not None else random_scenarios(config, FLIGHTS, False, SEED)
     each = np.tile(np.repeat(sets, len(drawn), axis=0), (len(CONDITIONS), 1))
-    gains = type(law.gains)(*each.astype(np.float32).T)
-    return costs_of(type("Tuned", (law,), {"gains": gains})(config), drawn, len(sets), allowed)
+    gains = type(controller.gains)(*each.astype(np.float32).T)
+    return costs_of(type("Tuned", (controller,), {"gains": gains})(config), drawn, len(sets), allowed)
 
 
 def costs_of_mpc(values: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """`costs_of` `mpc` with the tuning `values` (k,)."""
     config = preset("paper")
-    law = type("Tuned", (Mpc,), {"tuning": tuned(Mpc.tuning, values)})(config)
-    return costs_of(law, from_rest(config), 1, ALLOWED[law.name])
+    controller = type("Tuned", (Mpc,), {"tuning": tuned(Mpc.tuning, values)})(config)
+    return costs_of(controller, from_rest(config), 1, ALLOWED[controller.name])
 
 
 def minimise(
@@ -208,25 +212,25 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=SETS, help="of gains in each round")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
-    law = TUNED[options.law]
+    controller = TUNED[options.law]
     team = options.law == "mpc-team"
-    given = law.team_tuning if team else law.tuning if law is Mpc else law.gains
+    given = controller.team_tuning if team else controller.tuning if controller is Mpc else controller.gains
     start = np.log([getattr(given, name) for name in searched(given)])
     if team:
         best, least = minimise(
             lambda sets: costs_of_team(np.exp(sets))[0], start, options.width, options.sets, options.rounds
         )
         shown = costs_of_team(np.exp([best]))[1]
-    elif law is Mpc:
+    elif controller is Mpc:
         with ProcessPoolExecutor(CORES, multiprocessing.get_context("spawn")) as pool:
             each = lambda sets: np.array([cost[0] for cost, _ in pool.map(costs_of_mpc, np.exp(sets))])  # noqa: E731
             best, least = minimise(each, start, options.width, options.sets, options.rounds)
         shown = costs_of_mpc(np.exp(best))[1]
     else:
         best, least = minimise(
-            lambda sets: costs(law, np.exp(sets))[0], start, options.width, options.sets, options.rounds
+            lambda sets: costs(controller, np.exp(sets))[0], start, options.width, options.sets, options.rounds
         )
-        shown = costs(law, np.exp([best]))[1]
+        shown = costs(controller, np.exp([best]))[1]
     gains = dict(zip(searched(given), np.exp(best).tolist(), strict=True))
     rounded = [{key: round(float(np.ravel(value)[0]), 3) for key, value in one.items()} for one in shown]
     found = {"law": options.law, "gains": gains, "cost": least, "medians": rounded}

@@ -28,10 +28,10 @@ from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile
-from mjxball.policy.file import law_of, load_file, shipped_policies, shipped_policy
+from mjxball.policy.file import controller_of, load_file, shipped_policies, shipped_policy
 from mjxball.policy.formats.c_header import APP, c_header, footprint
 from mjxfly.app.generate import CORE, options, rig_header, sources
-from mjxfly.card import config_of
+from mjxfly.policy_setup import config_of
 
 HOST = ("gcc",)
 ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
@@ -300,7 +300,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
     Observations wander within 1 s or so, with mean and spread that they had in training by the policy's own scaling.
     """
     follower, random = Policy(policy, "follower"), np.random.default_rng(3)
-    scale, kept = policy.observation_scale[:18].astype(float), 1 - policy.card["control_period"]
+    scale, kept = policy.observation_scale[:18].astype(float), 1 - policy.metadata["control_period"]
     spread = np.where(scale > 0, 1 / np.where(scale > 0, scale, 1), 0.3)
     records, actions = [], []
     for _ in range(-(-steps // FLIGHT)):
@@ -309,7 +309,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
         for noise in random.normal(scale=math.sqrt(1 - kept**2), size=(FLIGHT, 18)):
             place = kept * place + noise
             seen = (policy.observation_mean[:18] + spread * place).astype(np.float32)
-            memory = follower.memory if follower.memory is not None else follower.law.start(seen)
+            memory = follower.memory if follower.memory is not None else follower.controller.start(seen)
             records.append(np.concatenate([memory, seen]).astype(np.float32))
             actions.append(follower.scaled(seen))
     return np.array(records[:steps]), np.array(actions[:steps])
@@ -337,7 +337,7 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> Row:
     call = count(place, "step", footprint(policy, int8).flash)
     row: Row = {"instructions": call.instructions, "cycles": call.cycles, "ms": call.milliseconds}
     try:
-        (place / "rig.h").write_text(rig_header(policy, config_of(policy.card), int8))
+        (place / "rig.h").write_text(rig_header(policy, config_of(policy.metadata), int8))
     except InputError:  # a team: its follower's network alone
         return row
     for name in CORE:
@@ -350,16 +350,16 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> Row:
 def recurrent(units: int = UNITS) -> PolicyFile:
     """The shipped policy `flight` with a GRU of random weights in place of its network."""
     policy, random = load_file(shipped_policy("flight")), np.random.default_rng(2)
-    card = {field: value for field, value in policy.card.items() if field not in ("filters", "flown")}
-    card |= {"format_version": 5, "recurrent_units": units, "previous_action": True}
-    size = law_of(card).input_size
+    metadata = {field: value for field, value in policy.metadata.items() if field not in ("filters", "flown")}
+    metadata |= {"format_version": 5, "recurrent_units": units, "previous_action": True}
+    size = controller_of(metadata).input_size
 
     def layer(inputs: int, outputs: int) -> np.ndarray:
         return random.normal(scale=inputs**-0.5, size=(inputs, outputs)).astype(np.float32)
 
     return dataclasses.replace(
         policy,
-        card=card,
+        metadata=metadata,
         observation_mean=np.zeros(size, np.float32),
         observation_scale=np.append(policy.observation_scale[:18], np.ones(size - 18)).astype(np.float32),
         weights=(layer(size + units, HEAD), layer(HEAD + units, 6)),
@@ -370,7 +370,7 @@ def recurrent(units: int = UNITS) -> PolicyFile:
 
 def placed(policy: PolicyFile, name: str) -> PolicyFile:
     """`policy` as the follower of a pair, if it has to be told."""
-    return in_team(policy, name, PAIR) if law_of(policy.card).geometry else policy
+    return in_team(policy, name, PAIR) if controller_of(policy.metadata).geometry else policy
 
 
 def measure(policy: PolicyFile, name: str, int8: bool, steps: int) -> Row:

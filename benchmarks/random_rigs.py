@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball.config import Config, Plant
-from mjxball.control.followers import Law, PrivilegedInfo
+from mjxball.control.followers import Controller, PrivilegedInfo
 from mjxball.control.geometry import team_geometry
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.env import TransportEnv, make_physics
@@ -20,7 +20,7 @@ from mjxball.evaluate.metrics import Metrics, RunningMetrics, begin, results, up
 from mjxball.physics.engine import PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.plant import PlantParameters
-from mjxball.policy.inference import NetworkLaw
+from mjxball.policy.inference import NetworkController
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import RandomDisturbances
 from mjxball.sim.rigs import RigTable, rig_config, whole
@@ -32,7 +32,7 @@ SECONDS = 30.0  # of a flight
 def fly(
     config: Config,
     rigs: RigTable,
-    laws: Law | Sequence[Law],
+    controllers: Controller | Sequence[Controller],
     flights: int = 3,
     seconds: float = SECONDS,
     seed: int = 0,
@@ -46,10 +46,10 @@ def fly(
     own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig)
     env, period = TransportEnv(own, "newton-euler"), own.timing.control_period
     numbers: list[Any] | None = None
-    if isinstance(laws, Sequence):
-        numbers, rebuild = stacked(laws)
+    if isinstance(controllers, Sequence):
+        numbers, rebuild = stacked(controllers)
     else:
-        alike: Law = laws
+        alike: Controller = controllers
         rebuild = lambda _: alike  # noqa: E731
     times = period * np.arange(round(seconds / period) + 1, dtype=np.float32)
 
@@ -64,7 +64,7 @@ def fly(
     return [found[first : first + flights] for first in range(0, len(found), flights)]
 
 
-def _flight(env: TransportEnv, key: Any, rig: RigTable, law: Law, times: np.ndarray) -> RunningMetrics:
+def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, times: np.ndarray) -> RunningMetrics:
     """One flight of `rig` from a random start of `env`, over `times` [s], as a batch of one."""
     config, state = env.config, env.reset(key, None, rig)
     world, observation = state.pipeline_state, state.obs[..., :OBSERVATION_SIZE]
@@ -72,8 +72,8 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, law: Law, times: np.ndar
     physics = make_physics(config, "newton-euler", parameters)
     loop = ClosedLoop(config, physics, disturbances.sensors, parameters)
     limit, leader = config.scenario.termination_distance, config.plant.leader
-    if isinstance(law, AnyRigLaw):
-        law = law.on(rig, config.plant)
+    if isinstance(controller, AnyRigController):
+        controller = controller.on(rig, config.plant)
 
     def privileged(plant: PlantState, load: Any) -> PrivilegedInfo:
         return _privileged(plant, load, world.rig, config.plant.count)
@@ -83,41 +83,41 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, law: Law, times: np.ndar
         force = random.force if disturbances.present else None
         random, sample = disturbances.step(random)
         inputs, plant = Inputs(time, world.goal, world.goal, force, sample), carry.loop.plant
-        carry, row = control_step(loop, law, privileged, world.load, carry, inputs, 0.0)
+        carry, row = control_step(loop, controller, privileged, world.load, carry, inputs, 0.0)
         most = rig.numbers.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
         row = jax.tree.map(lambda part: part[None], row)._replace(time=time)
         return (carry, random, update(running, row, limit, most, leader)), None
 
     plant = world.loop.plant
     running = begin(plant.position[None], world.goal[None], plant.rotor_force[None], leader)
-    carry = Carry(world.loop, observation, law.start(observation))
+    carry = Carry(world.loop, observation, controller.start(observation))
     return jax.lax.scan(step, (carry, world.disturbances, running), times)[0][2]
 
 
-class AnyRigLaw(NetworkLaw):
+class AnyRigController(NetworkController):
     """A policy for any rig, which is told every rig's geometry."""
 
-    def on(self, rig: RigTable, plant: Plant) -> AnyRigLaw:
+    def on(self, rig: RigTable, plant: Plant) -> AnyRigController:
         """The law of the followers of `rig`, drones like those of `plant`."""
         found = copy.copy(self)
         found._geometry = team_geometry(plant, rig.numbers.mounts, rig.size)
         return found
 
 
-def rig_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:
+def rig_controllers(config: Config, rigs: RigTable, make: Callable[[Config], Controller]) -> list[Controller]:
     """`make` of every rig's own configuration."""
     return [make(rig_config(config, rigs, row)) for row in range(rigs.total)]
 
 
-def stacked(laws: Sequence[Law]) -> tuple[list[Any], Callable[[list[Any]], Law]]:
+def stacked(controllers: Sequence[Controller]) -> tuple[list[Any], Callable[[list[Any]], Controller]]:
     """(the numbers of `laws` of one class, stacked; a law from one row of them)."""
-    example, structure = jax.tree.flatten(vars(laws[0]))
+    example, structure = jax.tree.flatten(vars(controllers[0]))
     varies = [isinstance(leaf, (float, np.ndarray, np.floating)) for leaf in example]
-    rows = [jax.tree.leaves(vars(law)) for law in laws]
+    rows = [jax.tree.leaves(vars(controller)) for controller in controllers]
     numbers = [np.stack([row[place] for row in rows]) for place, drawn in enumerate(varies) if drawn]
 
-    def rebuild(row: list[Any]) -> Law:
-        found, values = copy.copy(laws[0]), iter(row)
+    def rebuild(row: list[Any]) -> Controller:
+        found, values = copy.copy(controllers[0]), iter(row)
         leaves = [next(values) if drawn else leaf for leaf, drawn in zip(example, varies, strict=True)]
         vars(found).update(jax.tree.unflatten(structure, leaves))
         return found

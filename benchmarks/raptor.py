@@ -30,13 +30,13 @@ from mjxball import cli
 from mjxball.bench import NAME, VERSION
 from mjxball.bench.entry import CONDITIONS, table
 from mjxball.bench.references import bars
-from mjxball.bench.success import are_met, summary
+from mjxball.bench.success import criteria_met, summary
 from mjxball.bench.tracks import TRACKS, World, worlds_of
 from mjxball.config import Config
 from mjxball.control import observation, rotations
 from mjxball.errors import InputError
 from mjxball.evaluate import metrics
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
 from mjxball.physics.step import ControlStep, make_control_step
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for track in PAIRS:
         (world,) = worlds_of(track, options.draw)
         flown = fly(world, Raptor())
-        met = are_met(flown, bars(track, options.draw, 0))
+        met = criteria_met(flown, bars(track, options.draw, 0))
         # There is no attitude command whose change could be measured.
         found[track] = {
             name: {**summary(flown[row::2], met[row::2]), "command_change": None} for row, name in enumerate(CONDITIONS)
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "command": shlex.join(["python", "benchmarks/raptor.py", *(arguments or sys.argv[1:])]),
         **{"commit": commit(), "versions": versions()},
     }
-    write_whole(options.out, json.dumps(entry, indent=1, allow_nan=False) + "\n")
+    write_atomically(options.out, json.dumps(entry, indent=1, allow_nan=False) + "\n")
     print(table(entry))
     return 0
 

@@ -32,14 +32,14 @@ from mjxball.bench.success import Bound, limits, numbers
 from mjxball.bench.tracks import RIG_LENGTH
 from mjxball.cli import run_command
 from mjxball.config import Config, from_record, preset, replace
-from mjxball.control.followers import Copy, Law
+from mjxball.control.followers import Controller, Copy
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import flies_any_rig, load_policy
 from mjxball.policy import Policy
-from mjxball.policy.inference import NetworkLaw
-from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_config, unpadded
-from random_rigs import AnyRigLaw, fly, rig_laws
+from mjxball.policy.inference import NetworkController
+from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, rig_config, sample_rigs, unpadded
+from random_rigs import AnyRigController, fly, rig_controllers
 from teams import effort_of
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
@@ -49,46 +49,46 @@ KNOWING = ("lqg-known-rig", "lqg-slow-known-rig")
 PAIR_LOAD = 0.2  # [kg]
 SHARES = ("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner")
 
-Made = tuple[str, Callable[[Config, RigTable], Law | list[Law]]]
+Made = tuple[str, Callable[[Config, RigTable], Controller | list[Controller]]]
 
 
 def followers(paths: Sequence[Path]) -> list[Made]:
     """(name, what makes its law for rigs of one size), the two LQGs that know each rig first."""
     return [
-        ("lqg-known-rig", lambda config, rigs: rig_laws(config, rigs, KnownRigLqg)),
-        ("lqg-slow-known-rig", lambda config, rigs: rig_laws(config, rigs, SlowKnownRigLqg)),
+        ("lqg-known-rig", lambda config, rigs: rig_controllers(config, rigs, KnownRigLqg)),
+        ("lqg-slow-known-rig", lambda config, rigs: rig_controllers(config, rigs, SlowKnownRigLqg)),
         ("copy", lambda config, rigs: Copy(config)),
-        ("adaptive-mass", lambda config, rigs: rig_laws(config, rigs, _adaptive)),
+        ("adaptive-mass", lambda config, rigs: rig_controllers(config, rigs, _adaptive)),
         *((path.stem, functools.partial(network, path)) for path in paths),
     ]
 
 
-def network(path: Path, config: Config, rigs: RigTable) -> Law:
+def network(path: Path, config: Config, rigs: RigTable) -> Controller:
     """A policy for any rig, or one for a single plant, which takes every rig for its own."""
     policy = Policy.load(path)
     if flies_any_rig(policy):
-        return AnyRigLaw(load_policy(path, rig_config(config, rigs, 0)))
-    own, size = from_record(policy.card["config"]), int(rigs.size[0])
+        return AnyRigController(load_policy(path, rig_config(config, rigs, 0)))
+    own, size = from_record(policy.metadata["config"]), int(rigs.size[0])
     if own.plant.count != size:
         raise InputError(f"{path} was made for {own.plant.count} drones, not {size}; say --sizes {own.plant.count}")
-    return NetworkLaw(load_policy(path, own))
+    return NetworkController(load_policy(path, own))
 
 
-def _adaptive(config: Config) -> Law:
+def _adaptive(config: Config) -> Controller:
     """With mass adaptation, and limits of its estimates that grow with the rig as they are for the pair."""
-    law, plant = Adaptive(config, adapts_mass=True), config.plant
+    controller, plant = Adaptive(config, adapts_mass=True), config.plant
     weight = plant.object_mass / PAIR_LOAD
     length = max(math.hypot(*drone.mount) for drone in plant.drones) / RIG_LENGTH
-    law._estimate_limits = tuple(limit * max(1.0, weight * length) for limit in law._estimate_limits)
-    law._mass_limit *= max(1.0, weight)
-    return law
+    controller._estimate_limits = tuple(limit * max(1.0, weight * length) for limit in controller._estimate_limits)
+    controller._mass_limit *= max(1.0, weight)
+    return controller
 
 
 def compare(config: Config, options: Any) -> dict[str, Any]:
     """Every follower on held-out rigs of all sizes, and the shares of rigs that are met."""
     rows, whole = list[Row](), dict[str, list[Row]]()
     for size in options.sizes:
-        drawn = draw_rigs(config, size, options.rigs, options.seed)
+        drawn = sample_rigs(config, size, options.rigs, options.seed)
         rigs = unpadded(drawn.rigs, size)
         flown: dict[str, list[list[Metrics]]] = {}
         for name, make in followers(options.policies):

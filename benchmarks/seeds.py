@@ -40,7 +40,7 @@ from batch import fly_compiled
 from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
 from mjxball.arrays import Array
-from mjxball.baselines import LAWS, make_baseline
+from mjxball.baselines import CONTROLLERS, make_baseline
 from mjxball.bench.scores import by_variant, run_benchmark
 from mjxball.bench.success import Bound, limits
 from mjxball.bench.suites import Suite, Variant
@@ -52,7 +52,7 @@ from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from mjxball.policy.inference import NetworkLaw
+from mjxball.policy.inference import NetworkController
 from mjxball.reading import parse_json
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
@@ -115,29 +115,29 @@ class Stacked:
     needs_privileged = False
 
     def __init__(self, policies: Sequence[Policy]):
-        self._law = NetworkLaw(policies[0])._law
-        networks = [NetworkLaw(policy)._network for policy in policies]
+        self._controller = NetworkController(policies[0])._controller
+        networks = [NetworkController(policy)._network for policy in policies]
         self.networks = jax.tree.map(lambda *parts: np.stack(parts), *networks)
 
     def start(self, observation: Array) -> Array:
         """Memory at the first `observation` (n k, 18)."""
-        return self._law.start(observation)
+        return self._controller.start(observation)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (n k, 3)) at `observation` (n k, 18)."""
         networks = jax.tree.map(lambda part: jnp.asarray(part, observation.dtype), self.networks)
-        seen = self._law.network_input(observation, memory)
+        seen = self._controller.network_input(observation, memory)
         parts = seen.reshape(len(networks.mean), -1, seen.shape[-1])
         scaled = jax.vmap(Network.__call__)(networks, parts)
         scaled = scaled.reshape(-1, scaled.shape[-1])
-        return self._law.next(memory, observation, scaled), self._law.command(scaled, observation)
+        return self._controller.next(memory, observation, scaled), self._controller.command(scaled, observation)
 
 
 class Single(Stacked):
     """One of them, whose network may be traced."""
 
     def __init__(self, every: Stacked, network: Any):
-        self._law = every._law
+        self._controller = every._controller
         self.networks = jax.tree.map(lambda part: part[None], network)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
@@ -149,7 +149,7 @@ class Single(Stacked):
 def fly(config: Config, policies: list[Policy], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
     """Metrics of every policy in every scenario."""
     count = len(scenarios)
-    flown = fly_compiled(config, policies[0], list(scenarios) * len(policies), law=Stacked(policies))
+    flown = fly_compiled(config, policies[0], list(scenarios) * len(policies), controller=Stacked(policies))
     return [flown[first : first + count] for first in range(0, len(flown), count)]
 
 
@@ -196,7 +196,7 @@ def reached(mine: dict[str, float], best: dict[str, float]) -> list[str]:
 
 def fly_others(config: Config) -> dict[str, list[Row]]:
     """Of every level and every cell beyond trim the smallest numbers of the others, and whose they are."""
-    rivals = [make_baseline(name, config) for name in LAWS if name != "oracle"]
+    rivals = [make_baseline(name, config) for name in CONTROLLERS if name != "oracle"]
     rivals += [load_policy(shipped_policy(name), config) for name in RIVALS]
     levels, beyond = [], []
     scores = run_benchmark(config, rivals, read_levels(), FLIGHTS, "newton-euler", print)

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from batch import fly_compiled, law_of
+from batch import controller_of, fly_compiled
 from harness import Row, arguments, say, table, write
 from mjxball.arrays import Array
 from mjxball.baselines import make_baseline
@@ -36,7 +36,7 @@ from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control import rotations
 from mjxball.control.constants import trim_limit
-from mjxball.control.followers import Follower, Law
+from mjxball.control.followers import Controller, Follower
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
@@ -75,14 +75,18 @@ class Hover:
 
 
 def linearised_hovers(
-    config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0
+    config: Config, controller: Controller, cases: Sequence[tuple[float, float, float]], delay: int = 0
 ) -> list[Hover]:
     """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
-    return linearised(config, lambda _: law, np.zeros(1), cases, delay)[0]
+    return linearised(config, lambda _: controller, np.zeros(1), cases, delay)[0]
 
 
 def linearised(
-    config: Config, law: Callable[[Any], Law], numbers: Any, cases: Sequence[tuple[float, float, float]], delay: int
+    config: Config,
+    controller: Callable[[Any], Controller],
+    numbers: Any,
+    cases: Sequence[tuple[float, float, float]],
+    delay: int,
 ) -> list[list[Hover]]:
     """`linearised_hovers` of every one of k laws, `law` of traced numbers: a tree of arrays (k, ...)."""
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
@@ -93,7 +97,7 @@ def linearised(
         loads = jax.tree.map(jnp.asarray, rollout.load_of(config, scenarios))
 
         def of_one(own: Any) -> tuple[Array, Array, Array, Array]:
-            start, step = closed_loop(config, law(own), delay)
+            start, step = closed_loop(config, controller(own), delay)
             return jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load)))(loads)
 
         found = map(np.asarray, jax.jit(jax.vmap(of_one))(jax.tree.map(jnp.asarray, numbers)))
@@ -115,12 +119,12 @@ def _radius(jacobian: np.ndarray) -> float:
 
 
 def delay_margins(
-    config: Config, law: Law, cases: Sequence[tuple[float, float, float]], longest: int = 15
+    config: Config, controller: Controller, cases: Sequence[tuple[float, float, float]], longest: int = 15
 ) -> list[int]:
     """For every case the control steps of delay up to which its hover stays stable; -1 if it never is."""
     margins = [-1] * len(cases)
     for delay in range(longest + 1):
-        for number, hover in enumerate(linearised_hovers(config, law, cases, delay)):
+        for number, hover in enumerate(linearised_hovers(config, controller, cases, delay)):
             if hover.stable and margins[number] == delay - 1:
                 margins[number] = delay
         if max(margins) < delay:
@@ -128,7 +132,9 @@ def delay_margins(
     return margins
 
 
-def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], Array], Callable[[Array, Load], Array]]:
+def closed_loop(
+    config: Config, controller: Controller, delay: int
+) -> tuple[Callable[[Load], Array], Callable[[Array, Load], Array]]:
     """(`start(load)` -> z, `step(z, load)` -> z one control period on) for a goal at the origin, on vectors z (k,).
 
     z holds position, Euler angles, velocity, rates, rotor forces, the follower's memory, older observations.
@@ -145,7 +151,7 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     def first(load: Load) -> tuple[PlantState, Any, Array]:
         plant = start_state(config, still, still, still, load.believed_mass, zero)
         observation = loop.observe(plant, goal)
-        return plant, law.start(observation), jnp.broadcast_to(observation, (delay, *observation.shape))
+        return plant, controller.start(observation), jnp.broadcast_to(observation, (delay, *observation.shape))
 
     def start(load: Load) -> Array:
         return flat(*first(load))[0]
@@ -159,7 +165,7 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
         sensors = SensorState(delay, (), past) if delay else SensorState()
         state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
         carry, inputs = rollout.Carry(state, past[-1], memory), rollout.Inputs(zero, goal, goal, None, Sample())
-        (moved, _, memory), _ = rollout.control_step(loop, law, privileged, load, carry, inputs, 0.0)
+        (moved, _, memory), _ = rollout.control_step(loop, controller, privileged, load, carry, inputs, 0.0)
         older = moved.sensors.past[1:] if delay else older
         # A flight that diverged stays where it was, which is no hover.
         return jnp.where(moved.diverged, jnp.nan, flat(moved.plant, memory, older)[0])
@@ -208,8 +214,8 @@ def grid(config: Config, unknown: bool) -> list[tuple[float, float, float]]:
 
 def about_hover(config: Config, follower: Follower, cases: list[Any]) -> list[Row]:
     """One row for each case."""
-    law, period = law_of(follower), config.timing.control_period
-    found, margins = linearised_hovers(config, law, cases), delay_margins(config, law, cases, LONGEST)
+    controller, period = controller_of(follower), config.timing.control_period
+    found, margins = linearised_hovers(config, controller, cases), delay_margins(config, controller, cases, LONGEST)
     rows = []
     for hover, margin in zip(found, margins, strict=True):
         row = {"follower": follower.name, "offset": hover.offset, "mass": hover.mass, "radius": hover.radius}

@@ -28,8 +28,8 @@ from mjxball import Policy, Scenario
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.control.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
-from mjxball.evaluate.paper_figures import draw_figure
-from mjxball.evaluate.plots import PANELS, draw_flights
+from mjxball.evaluate.paper_figures import plot_figure
+from mjxball.evaluate.plots import PANELS, plot_flights
 from mjxball.evaluate.results import fly_scenarios, scenario_title
 from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
@@ -53,7 +53,7 @@ def flights(names: list[str | Path], scenario: Scenario, path: Path, panels: tup
         make_baseline(str(name), config) if name in classical else Policy.load(policy_path(str(name))) for name in names
     ]
     flown = fly_scenarios(config, followers, [scenario], "newton-euler")
-    draw_flights(flown, scenario_title(flown[0]), path, panels)
+    plot_flights(flown, scenario_title(flown[0]), path, panels)
 
 
 def copying(out: Path) -> None:
@@ -69,7 +69,7 @@ def flight(out: Path) -> None:
 def crazyflie_stand(out: Path) -> None:
     """Archive, page crazyflie: `python eval.py figures --only stand --out figures`."""
     policy = Policy.load(shipped_policy("stand"))
-    (out / "crazyflie-stand.svg").write_bytes(draw_figure("stand", [policy], "newton-euler").picture)
+    (out / "crazyflie-stand.svg").write_bytes(plot_figure("stand", [policy], "newton-euler").picture)
 
 
 def crazyflie_gains(out: Path) -> None:
@@ -151,7 +151,7 @@ def viewer(out: Path) -> None:
 
 def tutorial(out: Path) -> None:
     """Page tutorial: its commands, and what they leave."""
-    from mjxball.train.curves import draw_training
+    from mjxball.train.curves import plot_training
 
     text = (REPOSITORY / "docs" / "tutorial.md").read_text()
     blocks = "".join(re.findall(r"^```bash\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE))
@@ -161,13 +161,13 @@ def tutorial(out: Path) -> None:
         printed = "".join(run(shlex.split(command, comments=True), place) for command in commands)
         excerpts(printed, (place / "first.h").read_text(), out)
         first = place / "runs" / "first"
-        draw_training(first, configs.preset("transport"), out / "tutorial-training.svg")
+        plot_training(first, configs.preset("transport"), out / "tutorial-training.svg")
         flights(["copy", first / "policy.npz"], REFERENCE, out / "tutorial-flight.svg")
         screenshot(place / "benchmark" / "report.html", out / "tutorial-report.png")
         screenshot(place / "first.html", out / "tutorial-viewer.png")
         flown = read_recording(place / "first.jsonl")
         log = without_goal(result_of(flown, "first, flown"), flown.guided_rows)
-        draw_flights([log], "Rehearsal on the twin", out / "tutorial-rehearsal.svg", (Z, ERROR, ROLL))
+        plot_flights([log], "Rehearsal on the twin", out / "tutorial-rehearsal.svg", (Z, ERROR, ROLL))
 
 
 def excerpts(printed: str, header: str, out: Path) -> None:

@@ -56,13 +56,13 @@ def main() -> None:
     config = preset("transport")
     scenario = Scenario(omega=OMEGA, amplitude=AMPLITUDE, goal=GOAL, seconds=END)
     followers = []
-    for name, text, law in (
+    for name, text, controller in (
         ("copy", "PD law alone", make_baseline("copy", config)),
         ("lqg-offset-free", "classical law", make_baseline("lqg-offset-free", config)),
         ("balance", "trained network", Policy.load(shipped_policy("balance"))),
     ):
         colour = ImageColor.getrgb(LOOKS[name][0])
-        flight = simulate(config, law, scenario, "newton-euler")
+        flight = simulate(config, controller, scenario, "newton-euler")
         rows = np.searchsorted(flight.time, END + SHOWN * (np.arange(FRAMES) / FRAMES - 1))
         error = np.linalg.norm(flight.target - flight.position, axis=-1)
         parts = (part[rows] for part in (flight.position, flight.quaternion, flight.cg_offset, error))

@@ -15,7 +15,7 @@ import numpy as np
 
 from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt, run_command
 from mjxball.config import Attitude, Plant
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.plant import ROLLING_INERTIA, plant_parameters, rotors
 
 ASSEMBLY = "assembly"
@@ -211,7 +211,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     def command() -> int:
         plant = plant_setup(options.plant).plant
-        write_whole(output_file(options.out, ".xml"), to_mjcf(plant))
+        write_atomically(output_file(options.out, ".xml"), to_mjcf(plant))
         return 0
 
     return run_command(command)

@@ -26,7 +26,7 @@ from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make
 from mjxball.plant import PlantParameters, plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop, LoopState, TeamCommands
 from mjxball.sim.disturbances import RandomDisturbances, followers_axis
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 from mjxball.sim.randomization import ResetDistribution, Rig
 from mjxball.sim.rigs import RigTable, whole
 
@@ -98,14 +98,14 @@ class TransportEnv:
         self._followers = followers_axis(config)
         self._loop = None if self._resets.rigs else self._make_loop()
         self._ball_limit = ball_limit(config.plant)
-        self._law = law = follower_law(config)
+        self._controller = controller = follower_controller(config)
         # Jitted separately: `scalar_form` keeps such calls whole if their arrays are large. `jax.jit` needs a hashable
         # function, which `partial` makes of a method of the unhashable controller.
-        parts = self._input, self._answer, law.next if law.size else lambda *_: ()
+        parts = self._input, self._answer, controller.next if controller.size else lambda *_: ()
         self._network_input, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
         self._cg = make_cg_offset(config)
         commanded = layout.commanded(config.follower.load_axis_only, config.plant.cg_axis)
-        self._commanded = np.append(commanded, np.ones(law.units))
+        self._commanded = np.append(commanded, np.ones(controller.units))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # index of the tilt (roll, pitch) free of CG torque
         self._in_plane = len(config.plant.directions) == 2
         self._privileged_size = 0
@@ -124,17 +124,17 @@ class TransportEnv:
     @property
     def policy_input_size(self) -> int:
         """Length of the policy's part of the observation; the rest is privileged information of the critics."""
-        return self._law.input_size + self._law.units
+        return self._controller.input_size + self._controller.units
 
     @property
     def input_mask(self) -> list[float]:
         """1 for each entry of the observation that the policy uses, else 0."""
-        return [*self._law.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
+        return [*self._controller.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
 
     @property
     def critic_mask(self) -> list[float]:
         """1 for each entry of the observation that the critics use, else 0."""
-        return [*self._law.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
+        return [*self._controller.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
 
     @property
     def team_sizes(self) -> tuple[int, ...] | None:
@@ -144,12 +144,12 @@ class TransportEnv:
     @property
     def action_size(self) -> int:
         """Length of an action: roll, pitch, vertical acceleration, then the next state of a recurrent network."""
-        return layout.ACTION_SIZE + self._law.units
+        return layout.ACTION_SIZE + self._controller.units
 
     @property
     def recurrent_slots(self) -> slice:
         """Entries of the observation that hold the state of a recurrent network; empty without one."""
-        return slice(self.policy_input_size - self._law.units, self.policy_input_size)
+        return slice(self.policy_input_size - self._controller.units, self.policy_input_size)
 
     @property
     def backend(self) -> str:
@@ -296,7 +296,7 @@ class TransportEnv:
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._law.start(observation, self._geometry(rig)) if self._law.size else (),
+            history=self._controller.start(observation, self._geometry(rig)) if self._controller.size else (),
             action=jnp.zeros((*self._followers, 3)),
             command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
@@ -306,7 +306,7 @@ class TransportEnv:
 
     def _geometry(self, rig: Rig | None) -> Any:
         """Mount geometry of a world as given to its followers; None unless they take it."""
-        if not self._law.geometry:
+        if not self._controller.geometry:
             return None
         plant = self.config.plant
         if rig is not None and rig.drawn is not None:
@@ -317,24 +317,26 @@ class TransportEnv:
 
     def seen(self, world: PipelineState, observation: Float[Array, "... 18"]) -> Float[Array, "... input"]:
         """The networks' input: the policy's input, then the critics' privileged information."""
-        network_input = self._network_input(observation, world.history) if self._law.size else observation
+        network_input = self._network_input(observation, world.history) if self._controller.size else observation
         if self.config.follower.privileged_critic:
             network_input = jnp.concatenate([network_input, self._privileged(world)], axis=-1)
         return network_input
 
     def _input(self, observation: Float[Array, "... 18"], memory: Float[Array, "... m"]) -> Array:
         """Input of the policy network."""
-        if self._law.geometry:  # the geometry is constant, so no derivatives need be carried through it
+        if self._controller.geometry:  # the geometry is constant, so no derivatives need be carried through it
             history, geometry = memory[..., :-GEOMETRY_SIZE], memory[..., -GEOMETRY_SIZE:]
             memory = jnp.concatenate([history, jax.lax.stop_gradient(geometry)], axis=-1)
-        return self._law.network_input(observation, memory)
+        return self._controller.network_input(observation, memory)
 
     def _answer(
         self, action: Float[Array, "... actions"], observation: Float[Array, "... 18"], memory: Any
     ) -> tuple[Float[Array, "... 3"], Any]:
         """(command, memory at the next step) for the network's `action`."""
-        law = self._law
-        return law.command(action, observation), law.next(memory, observation, action) if law.size else ()
+        controller = self._controller
+        return controller.command(action, observation), controller.next(
+            memory, observation, action
+        ) if controller.size else ()
 
     def _first_privileged(self, rng: Array) -> Float[Array, "... privileged"]:
         return self._privileged(self._fresh_world(rng)[0])
@@ -398,7 +400,7 @@ class TransportEnv:
             action=after.action,
             last_action=before.action,
             command_change=after.command - before.command,
-            action_average=self._law.history.slowest_action(before.history) if remembers else None,
+            action_average=self._controller.history.slowest_action(before.history) if remembers else None,
             leader_command=commands.leader,
             follower_command=commands.follower,
             tilt_disagreement=(commands.follower - commands.leader)[..., self._unloaded],

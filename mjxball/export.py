@@ -14,7 +14,7 @@ from pathlib import Path
 from mjxball import config as configs
 from mjxball.cli import Parser, make_parser, output_file, plant_setup, quit_on_interrupt, run_command
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.policy import team
 from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
 
@@ -22,13 +22,13 @@ from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
 def policy_of_run(run: Path) -> PolicyFile:
     """The policy of the newest checkpoint in the run directory `run`. Raises InputError unless it is finite."""
     from mjxball.policy.export import is_sound, policy_file
-    from mjxball.sim.follower import follower_law
+    from mjxball.sim.follower import follower_controller
     from mjxball.train.checkpoint import restore_policy
     from mjxball.train.curves import training_summary
 
     config, learnt, steps, origin = restore_policy(run)
     policy = policy_file(
-        config, follower_law(config), learnt, steps, {**origin, **training_summary(run, origin["seed"])}
+        config, follower_controller(config), learnt, steps, {**origin, **training_summary(run, origin["seed"])}
     )
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
@@ -48,7 +48,7 @@ def in_team(policy: PolicyFile, name: str, plant: Path | None, drone: int | None
 def _write_onnx(out: Path, policy: PolicyFile) -> None:
     from mjxball.policy.formats.onnx_model import onnx_model
 
-    write_whole(out, onnx_model(policy, out.stem).SerializeToString())
+    write_atomically(out, onnx_model(policy, out.stem).SerializeToString())
 
 
 def _save_quantized(out: Path, policy: PolicyFile) -> None:
@@ -60,7 +60,7 @@ def _save_quantized(out: Path, policy: PolicyFile) -> None:
 def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
     from mjxball.policy.formats.c_header import c_header
 
-    write_whole(out, c_header(policy, out.stem, int8).encode("ascii"))
+    write_atomically(out, c_header(policy, out.stem, int8).encode("ascii"))
 
 
 Writer = Callable[[Path, PolicyFile], None]

@@ -62,7 +62,7 @@ def is_utf16(content: bytes) -> bool:
     return content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE))
 
 
-def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
+def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:
     """Write `data`, text as UTF-8, to `path` atomically: readers see the old file or the complete new one.
 
     This holds after a loss of power too. Of simultaneous writes, the last one remains. An OSError names `path`.

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.pictures import COLOURS
 
 BLUE, BROWN, GREEN, PINK, SKY, OLIVE = COLOURS
@@ -176,4 +176,4 @@ def rendered(figure: Any, ending: str | None = None) -> bytes:
 
 def save(figure: Any, path: Path) -> None:
     """Write the figure to `path` atomically, in the format of its suffix, and close it."""
-    write_whole(path, rendered(figure, path.suffix.removeprefix(".")))
+    write_atomically(path, rendered(figure, path.suffix.removeprefix(".")))

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 
-def quietly(name: str) -> Any:
+def import_quietly(name: str) -> Any:
     """Import the module `name` without output. MJX, which Brax imports too, prints that NVIDIA Warp is absent."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         return importlib.import_module(name)
@@ -18,12 +18,12 @@ def quietly(name: str) -> Any:
 
 def import_mjx() -> ModuleType:
     """`mujoco.mjx`."""
-    return quietly("mujoco.mjx")
+    return import_quietly("mujoco.mjx")
 
 
 def import_brax_env() -> tuple[type, type]:
     """Brax's `Env` and `State`."""
-    base = quietly("brax.envs.base")
+    base = import_quietly("brax.envs.base")
     return base.Env, base.State
 
 
@@ -52,7 +52,7 @@ class BraxTraining(NamedTuple):
 def import_brax_training() -> BraxTraining:
     """Brax's networks, SAC losses, running statistics and types."""
     names = ("networks", "agents.sac.losses", "acme.running_statistics", "acme.specs", "distribution", "types")
-    return BraxTraining(*(quietly(f"brax.training.{name}") for name in names))
+    return BraxTraining(*(import_quietly(f"brax.training.{name}") for name in names))
 
 
 class BraxPpo(NamedTuple):
@@ -64,4 +64,4 @@ class BraxPpo(NamedTuple):
 
 def import_brax_ppo() -> BraxPpo:
     """Brax's PPO losses and networks."""
-    return BraxPpo(*(quietly(f"brax.training.agents.ppo.{name}") for name in BraxPpo._fields))
+    return BraxPpo(*(import_quietly(f"brax.training.agents.ppo.{name}") for name in BraxPpo._fields))

@@ -20,7 +20,7 @@ from mjxfly.limits import NAMES, Check, FlightSettings
 from mjxfly.link import Link
 from mjxfly.monitor import UplinkWatch
 from mjxfly.packets import ZERO, Setpoint
-from mjxfly.setpoints import CURVE_NAMES, CurveName, Mapped, Variant, Variants
+from mjxfly.setpoints import CURVE_NAMES, BoundedSetpoint, CurveName, Variant, Variants
 from mjxfly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, FlightState
 from mjxfly.takeoff import STUCK
 from mjxfly.telemetry import DroneLink, Rig, object_state
@@ -30,7 +30,7 @@ PERIOD = 2  # ticks between two orders
 
 
 @dataclass(frozen=True)
-class Apps:
+class OnboardApps:
     """The apps that the drones are expected to carry."""
 
     name: str  # of the policy
@@ -138,7 +138,7 @@ class OnboardFlight(Flight):
         self._app_faults: list[Fault] = []  # of this tick
         super().begin(now)
 
-    def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
+    def _command(self) -> tuple[list[BoundedSetpoint] | None, list[Fault]]:
         """(None, []): the laptop computes no setpoints. Updates the flight statistics."""
         if self.supervisor.state in GUIDED:
             seen = object_state(self._states, self.rig)
@@ -155,7 +155,7 @@ class OnboardFlight(Flight):
     def _stuck_message(self) -> str:
         return f"{STUCK}: is it heavier, or does a propeller give less?"
 
-    def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+    def _setpoints(self, mapped: list[BoundedSetpoint] | None) -> list[Setpoint]:
         return [ZERO, ZERO]
 
     def _send(self, link: DroneLink, watch: UplinkWatch, value: Setpoint) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from mjxball.control import rotations
 from mjxfly import packets, probe, setpoints
-from mjxfly.card import Controller, PairCommands
 from mjxfly.display import View
 from mjxfly.ending import Ending
 from mjxfly.figures import Flown
@@ -20,8 +19,9 @@ from mjxfly.limits import FlightSettings
 from mjxfly.mocap import Mocap
 from mjxfly.monitor import Monitor, Sustained, UplinkWatch, link_faults
 from mjxfly.packets import ZERO, PacketError, Setpoint
+from mjxfly.policy_setup import FlightController, PairCommands
 from mjxfly.preflight import SpinCheck
-from mjxfly.setpoints import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
+from mjxfly.setpoints import SPIN_THRUST, BoundedSetpoint, CommandMap, CurveName, LastKnownState, Variants
 from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, FlightState, Supervisor
 from mjxfly.takeoff import TakeOff
 from mjxfly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
@@ -37,7 +37,7 @@ class Flight:
     def __init__(
         self,
         links: Sequence[DroneLink],
-        controller: Controller,
+        controller: FlightController,
         variants: Sequence[Variants],
         assumed: Sequence[CurveName],
         rig: Rig,
@@ -54,7 +54,9 @@ class Flight:
         self.interrupts, self.kill = 0, False
         self.ready: bool | None = None  # preflight checks: None not known yet, else whether they passed
         self.refusal = ""
-        self.excuse: Callable[[Fault], Exception | None] = lambda cause: None  # error if a slow computer is to blame
+        self.rehearsal_error: Callable[[Fault], Exception | None] = lambda cause: (
+            None
+        )  # error if a slow computer is to blame
         self.view: View | None = None
         self.spin = SpinCheck(links, variants, assumed, settings.motor)
         self.highest = [0, 0]  # largest thrust of each drone so far, sent or withheld in a dry run [units]
@@ -217,7 +219,7 @@ class Flight:
 
     # Control.
 
-    def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
+    def _command(self) -> tuple[list[BoundedSetpoint] | None, list[Fault]]:
         """Setpoints of both controllers, None while they are not in command; faults of these setpoints."""
         if self.supervisor.state not in GUIDED:
             return None, []
@@ -255,7 +257,7 @@ class Flight:
     @property
     def carry(self) -> str:
         """In a dry run on motion capture: how to move the pair by hand, so that the IMUs can verify the axes."""
-        return self._monitor.not_shown() if self._mocap is not None and self.settings.dry_run else ""
+        return self._monitor.unverified_axes() if self._mocap is not None and self.settings.dry_run else ""
 
     @property
     def _probes(self) -> bool:
@@ -312,8 +314,12 @@ class Flight:
     def _advance(self, faults: list[Fault]) -> None:
         before = self.supervisor
         self.supervisor = before.after(faults, self._now)
-        if self.supervisor.cause and not before.cause and (excuse := self.excuse(self.supervisor.cause)):
-            raise excuse
+        if (
+            self.supervisor.cause
+            and not before.cause
+            and (rehearsal_error := self.rehearsal_error(self.supervisor.cause))
+        ):
+            raise rehearsal_error
         entered = self.supervisor.state
         if entered is before.state:
             return
@@ -345,7 +351,7 @@ class Flight:
 
     # Output.
 
-    def _setpoints(self, mapped: list[Mapped] | None) -> list[Setpoint]:
+    def _setpoints(self, mapped: list[BoundedSetpoint] | None) -> list[Setpoint]:
         """Setpoints of leader and follower in the supervisor's state; `mapped` are those of the controllers."""
         state = self.supervisor.state
         if state in GUIDED:

@@ -17,7 +17,7 @@ from mjxball import cli
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
-from mjxball.evaluate.plots import PANELS, draw_flights
+from mjxball.evaluate.plots import PANELS, plot_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.plotting import SIMULATED, STYLES, file_format, style
 from mjxball.sim.scenario import Scenario
@@ -25,7 +25,7 @@ from mjxball.sim.trajectory import Trajectory
 from mjxball.terminal import warn
 from mjxfly.log_export import WRITERS
 from mjxfly.log_import import UNKNOWN
-from mjxfly.recording import Recording, fly_again, read_recording
+from mjxfly.recording import Recording, read_recording, simulate_setpoints
 from mjxfly.twin.conditions import Conditions
 
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
@@ -74,7 +74,7 @@ def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None
     for remark in recording.remarks:
         warn(remark)
     recorded = result_of(recording, f"{recording.policy}, flown")
-    simulated = result_of(fly_again(recording), SIMULATED)
+    simulated = result_of(simulate_setpoints(recording), SIMULATED)
     print(differences(recorded, simulated))  # noqa: T201
     with style(look):
         print(f"figure: {draw(recorded, simulated, recording.guided_rows, out)}")  # noqa: T201
@@ -118,7 +118,7 @@ def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     both = [without_goal(recorded, guided), _cut(without_goal(simulated, guided), valid_rows(recorded, simulated))]
     path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
-    draw_flights(both, f"assumed: {scenario_title(recorded)}", path, ASSUMED)
+    plot_flights(both, f"assumed: {scenario_title(recorded)}", path, ASSUMED)
     return path
 
 

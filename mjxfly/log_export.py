@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 from mjxball import __version__, cli
 from mjxball.config import to_dict
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxfly import flight_log
 from mjxfly.limits import NAMES
 from mjxfly.log_import import is_foreign
@@ -102,7 +102,7 @@ def write_mcap(path: Path, log: Path) -> list[str]:
     for line, record in flight_log.read_lines(log, remarks.append):
         recorder.take_line(line, record)
     recorder.flush()
-    write_whole(path, stream.getvalue())
+    write_atomically(path, stream.getvalue())
     return remarks
 
 
@@ -164,7 +164,7 @@ def write_csv(path: Path, log: Path) -> list[str]:
     writer.writerow(columns)
     for row in zip(*columns.values(), strict=True):
         writer.writerow("" if isinstance(one, float) and math.isnan(one) else one for one in row)
-    write_whole(path, stream.getvalue().encode())
+    write_atomically(path, stream.getvalue().encode())
     return remarks
 
 
@@ -176,7 +176,7 @@ def write_parquet(path: Path, log: Path) -> list[str]:
     columns, remarks = table(log)
     stream = io.BytesIO()
     pyarrow.parquet.write_table(pyarrow.table(columns), stream)
-    write_whole(path, stream.getvalue())
+    write_atomically(path, stream.getvalue())
     return remarks
 
 

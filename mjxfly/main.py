@@ -21,9 +21,14 @@ from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxfly import app_flight, clock, limits
 from mjxfly.app import generate
-from mjxfly.card import (
-    Controller,
-    ThrustChoice,
+from mjxfly.crazyswarm import CrazyswarmPair, read_pair
+from mjxfly.display import live_view
+from mjxfly.limits import FlightSettings, Limits
+from mjxfly.mocap import KINDS, MocapSettings, ready
+from mjxfly.parameters import check_parameters
+from mjxfly.policy_setup import (
+    FlightController,
+    ThrustOptions,
     drone_of,
     goal_of,
     is_crazyflie,
@@ -33,17 +38,12 @@ from mjxfly.card import (
     times_of,
     variants,
 )
-from mjxfly.crazyswarm import CrazyswarmPair, read_pair
-from mjxfly.display import live_view
-from mjxfly.limits import FlightSettings, Limits
-from mjxfly.mocap import KINDS, MocapSettings, ready
-from mjxfly.parameters import check_parameters
 from mjxfly.preflight import Preflight, read_gains
 from mjxfly.rehearsal import Rehearsal
 from mjxfly.session import FlightSetup, fly
 from mjxfly.setpoints import CURVE_NAMES
 from mjxfly.telemetry import Rig
-from mjxfly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
+from mjxfly.twin.conditions import FAULT_KINDS, add_twin_options, check_surroundings, read_fault, twin_arguments
 from mjxfly.uri import HERE, Udp, Uri, check_pair, parse_uri, share_dongle
 
 SLOW = ("slow", 1.0, clock.SLOWEST)
@@ -241,14 +241,14 @@ def check_log(log: Path, viewed: bool) -> None:
 def check_twin_options(options: argparse.Namespace) -> None:
     """Raise InputError for invalid flags of a rehearsal or of --onboard."""
     own = [f"--{name}" for name in (*IMPAIRMENTS, "fault", "slow") if getattr(options, name)]
-    given = [*own, *given_twin_options(options)]
+    given = [*own, *twin_arguments(options)]
     if given and not options.rehearse:
         raise InputError(f"{given[0]} is for --rehearse only")
     if options.upload and options.onboard != "int8":
         raise InputError("--upload takes weights of 8 bits: --onboard int8 --upload")
     if options.onboard and options.mocap:
         raise InputError("--onboard cannot show that the axes of --mocap are right: leave one of them out")
-    check_twin(options)
+    check_surroundings(options)
     for fault in options.fault:
         read_fault(fault)
 
@@ -270,7 +270,7 @@ def rehearsed_options(options: argparse.Namespace) -> list[str]:
 def twin_options(options: argparse.Namespace) -> list[str]:
     """The twin's flags for link, faults, drones and surroundings."""
     worse = [f"--{name}={getattr(options, name)}" for name in IMPAIRMENTS if getattr(options, name) is not None]
-    return [*worse, *(f"--fault={fault}" for fault in options.fault), *given_twin_options(options)]
+    return [*worse, *(f"--fault={fault}" for fault in options.fault), *twin_arguments(options)]
 
 
 def on_board(
@@ -281,9 +281,9 @@ def on_board(
         raise InputError("--onboard flies the thrust map in the app: leave --thrust, --hover and --mass out")
     policy, name = load_policy(options.policy), options.policy.stem
     generate.check_policy(policy, name)
-    idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
+    idents = [generate.weights_crc(policy, int8) for int8 in (False, True)]
     weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None
-    apps = app_flight.Apps(name, idents, round(1000 * policy.card["control_period"]), weights)
+    apps = app_flight.OnboardApps(name, idents, round(1000 * policy.metadata["control_period"]), weights)
     variants = app_flight.variants_of(setup.variants, setup.rig, settings)
     return replace(setup, variants=variants, apps=apps), app_flight.settings_of(settings)
 
@@ -299,16 +299,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         capture = mocap_settings(options, links)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy(load_policy(options.policy), options.policy.stem)
-        controller = Controller(policy)
+        controller = FlightController(policy)
         config = controller.config
-        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
+        choice = ThrustOptions(options.thrust, options.hover, options.curve, options.mass)
         more: PairGains = ({}, {})
         for path, given in parameters_of(options, swarm):
             check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
             more = {**more[0], **given[0]}, {**more[1], **given[1]}
         if options.twin_load is not None:
             check_loaded(config)
-        rig = Rig.of_card(policy.card)
+        rig = Rig.from_metadata(policy.metadata)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)
         goal = tuple(options.goal or goal_of(config))
         if not limits.within_fence(goal, rig, Limits()):

@@ -134,7 +134,7 @@ class ImuWatch:
             self._moved_by = np.maximum(self._moved_by, np.abs(known[-1].position - known[0].position))
         return why if time - self._wrong_since >= CONTRADICTING else ""
 
-    def not_shown(self) -> str:
+    def unverified_axes(self) -> str:
         """Instruction to move the drone by hand so that the remaining axes are verified; empty if all are."""
         turns = [name for name, angle in zip("xyz", self._turned_by, strict=True) if angle < TURNED]
         moves = [name for name, way in zip("xyz", self._moved_by, strict=True) if way < MOVED]

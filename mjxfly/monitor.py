@@ -131,9 +131,9 @@ class Monitor:
                 faults.append(Fault(Event.BATTERY, f"{name} at {state.battery:.2f} V"))
         return faults
 
-    def not_shown(self) -> str:
+    def unverified_axes(self) -> str:
         """Instruction to move the pair by hand so that the IMUs verify the remaining axes; empty if none remain."""
-        orders = [(name, watch.imu.not_shown()) for name, watch in zip(NAMES, self._drones, strict=True)]
+        orders = [(name, watch.imu.unverified_axes()) for name, watch in zip(NAMES, self._drones, strict=True)]
         return next((f"{order} within a second (the {name} has not shown it)" for name, order in orders if order), "")
 
     def _measured(self, phase: FlightState, links: Sequence[DroneLink], now: float) -> list[Fault]:

@@ -16,8 +16,8 @@ from mjxball.control.crazyflie import PARAMETERS, PairGains, pair_gains, with_ga
 from mjxball.control.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxball.errors import InputError
 from mjxball.reading import near
-from mjxfly.card import is_crazyflie, with_curve
 from mjxfly.limits import NAMES
+from mjxfly.policy_setup import is_crazyflie, with_curve
 from mjxfly.setpoints import CurveName
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters

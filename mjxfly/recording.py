@@ -17,11 +17,11 @@ from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
 from mjxball.reading import check_times
 from mjxfly import flight_log, log_consistency
-from mjxfly.card import ThrustChoice, command_maps, drone_of, gains_of, with_curve
 from mjxfly.limits import NAMES, ticks_per_command
 from mjxfly.log_consistency import SILENCE
 from mjxfly.log_schema import Record
 from mjxfly.packets import DroneState
+from mjxfly.policy_setup import ThrustOptions, command_maps, drone_of, gains_of, with_curve
 from mjxfly.setpoints import CURVE_NAMES, CurveName, ForceCurve
 from mjxfly.supervisor import FlightState
 from mjxfly.telemetry import ObjectState, Rig, object_state
@@ -69,7 +69,7 @@ class FirmwareSetup(NamedTuple):
     def force_curves(self, config: Config) -> tuple[ForceCurve, ForceCurve]:
         """Force of leader's and follower's motors over the sent thrust."""
         leader, follower = (
-            command_maps(with_curve(config, name), ThrustChoice(curve=name))[0].curve for name in self.curves
+            command_maps(with_curve(config, name), ThrustOptions(curve=name))[0].curve for name in self.curves
         )
         return leader, follower
 
@@ -300,7 +300,7 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
     )
 
 
-def twin_of(recording: Recording) -> DroneKind:
+def drone_kind_of(recording: Recording) -> DroneKind:
     """The twin's kind of drone with the force curve of the flight. Raises InputError if the drones' curves differed."""
     curve = one_curve(recording.setup.curves)
     if curve is None:
@@ -309,13 +309,13 @@ def twin_of(recording: Recording) -> DroneKind:
     return drone_kind(drone_of(recording.config), curve)
 
 
-def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
+def simulate_setpoints(recording: Recording, kind: DroneKind | None = None) -> Recording:
     """Open-loop simulation of the recorded setpoints, from rest at the recorded start, with drones of `kind`.
 
-    Without a `kind` it is that of the log (`twin_of`). Model errors accumulate with time. The object's mass and the
-    CG's motion are not logged; they are those of a rehearsal (`twin.conditions.Conditions.of`).
+    Without a `kind` it is that of the log (`drone_kind_of`). Model errors accumulate with time. The object's mass and
+    the CG's motion are not logged; they are those of a rehearsal (`twin.conditions.Conditions.of`).
     """
-    pair = pair_of(recording.config, kind or twin_of(recording), Surroundings(exact=True))
+    pair = pair_of(recording.config, kind or drone_kind_of(recording), Surroundings(exact=True))
     for drone, gains in enumerate(recording.setup.gains):
         for name, value in gains.items():
             pair.set_parameter(drone, name, value)

@@ -74,7 +74,7 @@ class Rehearsal(Child):
         """Largest lateness of the twin or of its reports within `WINDOW` [s]."""
         return max([clock.now() - self._newest - BEAT, *(late for _, late in list(self._lateness))])
 
-    def excuse(self, cause: Fault | None = None) -> RehearsalError | None:
+    def rehearsal_error(self, cause: Fault | None = None) -> RehearsalError | None:
         """Error that replaces a fault `cause`, or a failure, if a slow or failed twin may have caused it; else None."""
         if cause is not None and cause.event in (Event.KEY_KILL, Event.INTERRUPT):
             return None

@@ -18,8 +18,7 @@ from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
 from mjxfly import clock, packets, positioning
-from mjxfly.app_flight import Apps, OnboardFlight, check_ready
-from mjxfly.card import Controller
+from mjxfly.app_flight import OnboardApps, OnboardFlight, check_ready
 from mjxfly.connection import LinkError
 from mjxfly.display import Display, listening
 from mjxfly.figures import LEAST, SETTLING
@@ -28,6 +27,7 @@ from mjxfly.flight_log import Journal
 from mjxfly.limits import NAMES, Check, FlightSettings
 from mjxfly.link import Link
 from mjxfly.mocap import Mocap
+from mjxfly.policy_setup import FlightController
 from mjxfly.preflight import Preflight, check, prepare
 from mjxfly.process import Metronome, Timing, bounded, together, urgent
 from mjxfly.rehearsal import Rehearsal, RehearsalError
@@ -46,18 +46,18 @@ SWITCH_INTERVAL = 5e-4  # [s] between switches of Python threads; the default of
 class FlightSetup:
     """Controllers, drones and equipment of a flight."""
 
-    controller: Controller
+    controller: FlightController
     variants: Sequence[Variants]  # of leader and follower
     curve: CurveName  # assumed for both firmwares until their motors turn
     rig: Rig
     preflight: Preflight
     mocap: Mocap | None = None  # ready; the caller closes it
-    apps: Apps | None = None  # if the controllers run on board
+    apps: OnboardApps | None = None  # if the controllers run on board
     rehearsal: Rehearsal | None = None  # the twin; the caller closes it
 
-    def excuse(self, cause: Fault | None = None) -> RehearsalError | None:
-        """`Rehearsal.excuse` in a rehearsal, else None."""
-        return None if self.rehearsal is None else self.rehearsal.excuse(cause)
+    def rehearsal_error(self, cause: Fault | None = None) -> RehearsalError | None:
+        """`Rehearsal.rehearsal_error` in a rehearsal, else None."""
+        return None if self.rehearsal is None else self.rehearsal.rehearsal_error(cause)
 
 
 def fly(
@@ -72,7 +72,7 @@ def fly(
     header |= {
         "settings": dataclasses.asdict(settings),
         "policy": policy.name,
-        "config_hash": policy.card["config_hash"],
+        "config_hash": policy.metadata["config_hash"],
     }
     header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
     header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json((gains[0], gains[1]))}
@@ -104,7 +104,7 @@ def fly(
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
                 kind = Flight if setup.apps is None else OnboardFlight
                 flight = kind(*pair, settings, journal.note, watchdog, setup.mocap)
-                flight.excuse = setup.excuse
+                flight.rehearsal_error = setup.rehearsal_error
                 warm_up(kind, *pair, settings, clock.now())
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
@@ -115,7 +115,7 @@ def fly(
             _say("interrupted before take-off")
             return 1
         except (InputError, OSError) as error:
-            reason = setup.excuse() or error
+            reason = setup.rehearsal_error() or error
             journal.note("refused", text=str(reason))
             if setup.rehearsal is not None and isinstance(reason, RehearsalError):
                 _say(setup.rehearsal.end())
@@ -225,7 +225,7 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup)
         overwritten=sent,
         flown=None if figures is None else dataclasses.asdict(figures),
     )
-    if stayed and cause is None and (reason := setup.excuse()):
+    if stayed and cause is None and (reason := setup.rehearsal_error()):
         raise reason
     for text in sentences:
         _say(text)

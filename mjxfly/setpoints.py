@@ -63,7 +63,7 @@ class CommandMap:
     mass, T = m (g + az) / (cos roll cos pitch), as in simulation.
     """
 
-    law: Literal["paper", "calibrated"] = "calibrated"
+    thrust_model: Literal["paper", "calibrated"] = "calibrated"
     hover: float = 46000.0  # thr_hov [thrust units], of the paper; calibrate it for each rig
     per_acceleration: float = 1000.0  # k_pz [thrust units per m/s2], of the paper
     carried_mass: float = 0.035  # the drone and its share of the object [kg]
@@ -74,7 +74,7 @@ class CommandMap:
     @property
     def hover_thrust(self) -> float:
         """Thrust units at level hover."""
-        return self.hover if self.law == "paper" else self.curve.thrust(self.carried_mass * self.gravity)
+        return self.hover if self.thrust_model == "paper" else self.curve.thrust(self.carried_mass * self.gravity)
 
     def scaled(self, share: float) -> CommandMap:
         """The map of a drone whose hover force is `share` times that of this map."""
@@ -92,7 +92,7 @@ class Variant(NamedTuple):
 Variants = Mapping[CurveName, Variant]  # of one drone, by the curve of its firmware
 
 
-class Mapped(NamedTuple):
+class BoundedSetpoint(NamedTuple):
     """A setpoint, and whether its thrust was clipped."""
 
     setpoint: Setpoint
@@ -102,13 +102,13 @@ class Mapped(NamedTuple):
 def raw_thrust(command: Array, constants: CommandMap) -> float:
     """Thrust units before any bound for `command` = (roll, pitch [rad], vertical acceleration [m/s2])."""
     roll, pitch, vertical = (float(value) for value in command)
-    if constants.law == "paper":
+    if constants.thrust_model == "paper":
         return constants.hover + constants.per_acceleration * vertical
     level = math.cos(roll) * math.cos(pitch)
     return constants.curve.thrust(constants.carried_mass * (constants.gravity + vertical) / level)
 
 
-def to_setpoint(command: Array, constants: CommandMap) -> Mapped:
+def to_setpoint(command: Array, constants: CommandMap) -> BoundedSetpoint:
     """The bounded setpoint of `command` (3,), yaw rate 0. Raises packets.PacketError if a value is not finite."""
     roll, pitch, vertical = (float(value) for value in command)
     if not all(map(math.isfinite, (roll, pitch, vertical))):
@@ -117,7 +117,7 @@ def to_setpoint(command: Array, constants: CommandMap) -> Mapped:
     roll, pitch = (min(max(value, -limit), limit) for value in (roll, pitch))
     wanted = raw_thrust((roll, pitch, vertical), constants)
     thrust = min(max(wanted, THRUST_FLOOR), THRUST_CEILING)
-    return Mapped(setpoint(roll, pitch, 0.0, thrust), thrust != wanted)
+    return BoundedSetpoint(setpoint(roll, pitch, 0.0, thrust), thrust != wanted)
 
 
 def level(thrust: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Setpoint:

@@ -153,9 +153,9 @@ class Rig:
     follower_mount: tuple[float, float, float]
 
     @classmethod
-    def of_card(cls, card: Mapping[str, Any]) -> Rig:
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> Rig:
         """The rig that a policy was trained for, from its metadata."""
-        plant: Any = card["plant"]
+        plant: Any = metadata["plant"]
         leader = int(plant.get("leader", 0))
         mounts = [tuple(drone["mount"]) for drone in plant["drones"]]
         return cls(mounts[leader], mounts[1 - leader])

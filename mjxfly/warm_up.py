@@ -9,10 +9,10 @@ from __future__ import annotations
 import gc
 from collections.abc import Mapping, Sequence
 
-from mjxfly.card import Controller
 from mjxfly.flight import Flight
 from mjxfly.limits import FlightSettings
 from mjxfly.packets import Packet
+from mjxfly.policy_setup import FlightController
 from mjxfly.setpoints import CurveName, Variants
 from mjxfly.supervisor import Event, Fault, FlightState, Supervisor
 from mjxfly.telemetry import DroneLink, Rig, Telemetry
@@ -21,7 +21,7 @@ TICKS = 6  # in each state: longer than a command lasts
 STEP = 1e-4  # [s] between two ticks, so short that the received states stay fresh
 
 
-class Deaf:
+class SilentLink:
     """A link with the telemetry of a real one that sends nothing."""
 
     lost: str | None = None
@@ -46,7 +46,7 @@ class Deaf:
 def warm_up(
     kind: type[Flight],
     links: Sequence[DroneLink],
-    controller: Controller,
+    controller: FlightController,
     variants: Sequence[Variants],
     assumed: Sequence[CurveName],
     rig: Rig,
@@ -57,7 +57,7 @@ def warm_up(
 
     Resets `controller` and exempts all live objects from later garbage collections.
     """
-    deaf = [Deaf(link.telemetry) for link in links]
+    deaf = [SilentLink(link.telemetry) for link in links]
     flight = kind(deaf, controller, variants, assumed, rig, settings, lambda *_, **__: None)
     flight.begin(now)
     for state in FlightState:

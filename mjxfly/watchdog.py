@@ -104,7 +104,7 @@ def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
                 return None
 
 
-def way_down(number: int, seen: LastKnownState, unheard: float) -> list[Packet]:
+def descent_packets(number: int, seen: LastKnownState, unheard: float) -> list[Packet]:
     """Packets for drone `number`, one per `PERIOD`: a level descent, then stops and zeros.
 
     Both drones' lists have the same length, so that they stay in step.
@@ -176,7 +176,7 @@ def _warm_up() -> None:
     import cflib.crtp.udpdriver  # noqa: F401
 
     for number in range(2):
-        way_down(number, LastKnownState((40000, 40000), 0.1, 0.0, 0.0), SILENCE)
+        descent_packets(number, LastKnownState((40000, 40000), 0.1, 0.0, 0.0), SILENCE)
     gc.collect()
     gc.freeze()
 
@@ -185,7 +185,7 @@ def take_over(uris: Sequence[str], left: tuple[LastKnownState, float], rehearses
     """Bring both drones down from (state, age [s]) as returned by `watch`."""
     start = clock.now()
     threads = [
-        threading.Thread(target=bring_down, args=(uri, way_down(number, *left), start), daemon=True)
+        threading.Thread(target=bring_down, args=(uri, descent_packets(number, *left), start), daemon=True)
         for number, uri in enumerate(uris)
     ]
     for thread in threads:

@@ -16,7 +16,7 @@ from mjxfly.mocap import Mocap, MocapSettings
 from mjxfly.mocap_supervision import Frame, Pose
 from mjxfly.twin.conditions import QUIET
 from mjxfly.twin.positioning import ATTITUDE_NOISE, POSITION_NOISE
-from mjxfly.twin.virtual import STEP, VirtualTwin
+from virtual_twin import STEP, VirtualTwin
 
 EVERY = 2  # steps of the twin between two frames: 100 Hz
 See = Callable[[Frame], Frame]  # what a camera system makes of the true poses

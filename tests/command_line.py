@@ -117,7 +117,7 @@ def load_arrays(path: Path = TRANSPORT) -> tuple[dict[str, np.ndarray], dict[str
     return arrays, json.loads(str(arrays.pop("card")))
 
 
-def write_arrays(path: Path, arrays: dict[str, np.ndarray], card: Any) -> Path:
+def write_arrays(path: Path, arrays: dict[str, np.ndarray], metadata: Any) -> Path:
     """Write a policy file without any check."""
-    np.savez(path, **arrays, card=np.array(json.dumps(card)))
+    np.savez(path, **arrays | {"card": np.array(json.dumps(metadata))})
     return path

@@ -205,7 +205,7 @@ def array_values(draw: Random, content: bytes) -> bytes:
     return _replaced(content, name, bytes(changed))
 
 
-def _with_card(content: bytes, text: str) -> bytes:
+def _with_metadata(content: bytes, text: str) -> bytes:
     stream = io.BytesIO()
     try:
         np.save(stream, np.array(text))
@@ -228,9 +228,9 @@ def hostile_text(draw: Random) -> str:
     return draw.choice(choices)()
 
 
-def card_text(draw: Random, content: bytes) -> bytes:
+def metadata_text(draw: Random, content: bytes) -> bytes:
     """The whole card replaced."""
-    return _with_card(content, hostile_text(draw))
+    return _with_metadata(content, hostile_text(draw))
 
 
 def damaged(draw: Random, tree: Any) -> Any:
@@ -255,10 +255,10 @@ def damaged(draw: Random, tree: Any) -> Any:
     return tree
 
 
-def card_values(draw: Random, content: bytes) -> bytes:
+def metadata_values(draw: Random, content: bytes) -> bytes:
     """Fields of the card replaced, removed, renamed."""
-    card = json.loads(str(np.load(io.BytesIO(_entries(content)["card.npy"]))))
-    return _with_card(content, json.dumps(damaged(draw, card)))
+    metadata = json.loads(str(np.load(io.BytesIO(_entries(content)["card.npy"]))))
+    return _with_metadata(content, json.dumps(damaged(draw, metadata)))
 
 
 def json_values(draw: Random, content: bytes) -> bytes:
@@ -284,7 +284,7 @@ def csv_cells(draw: Random, content: bytes) -> bytes:
 
 ANY: tuple[Mutation, ...] = (flipped_bits, truncated, inserted, overwritten, removed)
 POLICY = (*ANY, false_sizes, bomb, odd_entries, many_entries, pickled)
-POLICY += (array_headers, array_values, card_values, card_text)
+POLICY += (array_headers, array_values, metadata_values, metadata_text)
 JSON, CSV = (*ANY, json_values, json_text), (*ANY, csv_cells)
 
 

@@ -9,19 +9,19 @@ from typing import Any
 from command_line import TRANSPORT
 from fly_policies import untrained
 
+import virtual_twin as virtual
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.policy import Policy, PolicyFile
-from mjxfly import card, packets
+from mjxfly import packets, policy_setup
 from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
 from mjxfly.setpoints import CommandMap
 from mjxfly.telemetry import Rig
-from mjxfly.twin import virtual
 from mjxfly.twin.conditions import DELIVERED, DroneKind
 from mjxfly.twin.pair import Pair
-from mjxfly.twin.physics import StandIn, StandInPlant
-from mjxfly.twin.virtual import MemoryLog, VirtualLink
+from mjxfly.twin.physics import SimplePair, SimplePlant
+from virtual_twin import MemoryLog, VirtualLink
 
 __all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "VirtualTwin", "log_header", "short_log", "thrusts"]
 MASS = 0.07
@@ -40,17 +40,17 @@ class VirtualTwin(virtual.VirtualTwin):
         log: Any = None,
     ):
         policy = Policy(contents, "given") if contents else Policy.load(TRANSPORT)
-        rig = Rig.of_card(policy.card)
-        plant = StandInPlant(mass=MASS, mounts=(rig.leader_mount, rig.follower_mount))
+        rig = Rig.from_metadata(policy.metadata)
+        plant = SimplePlant(mass=MASS, mounts=(rig.leader_mount, rig.follower_mount))
         maps = None if contents else (CommandMap(carried_mass=MASS / 2),) * 2
         settings = settings or FlightSettings(seconds=2.0)
-        super().__init__(policy, settings, physics=physics or StandIn(plant, kind), maps=maps, log=log)
+        super().__init__(policy, settings, physics=physics or SimplePair(plant, kind), maps=maps, log=log)
 
 
 def log_header(contents: PolicyFile, name: str = "nobody") -> dict[str, Any]:
     """What the runner writes first into the log of a flight of the policy: both firmwares are taken for linear ones."""
-    config = card.config_of(contents.card)
-    gains = gains_to_json(card.gains_of(card.with_curve(config, "linear")))
+    config = policy_setup.config_of(contents.metadata)
+    gains = gains_to_json(policy_setup.gains_of(policy_setup.with_curve(config, "linear")))
     return {"policy": name, "config": configs.to_dict(config), "curve": "linear", "gains": gains}
 
 

@@ -61,11 +61,11 @@ ODD_FILES: dict[str, Content] = {
 }
 
 
-def _changed(card: Callable[[str], str] = str, weight: float | None = None) -> bytes:
+def _changed(metadata: Callable[[str], str] = str, weight: float | None = None) -> bytes:
     """A shipped policy file with another text as its card, or one weight of another value."""
     with np.load(shipped_policy("balance")) as arrays:
         found = {name: array.copy() for name, array in arrays.items()}
-    found["card"] = np.array(card(str(found["card"])))
+    found["card"] = np.array(metadata(str(found["card"])))
     if weight is not None:
         found["weight_0"][0, 0] = weight
     stream = io.BytesIO()
@@ -77,7 +77,7 @@ def _edited(field: str, value: Any) -> bytes:
     return _changed(lambda text: json.dumps({**json.loads(text), field: value}))
 
 
-CARD_NUMBERS = {"gravity": 0, "control_period": 0, "action_reach": 2, "leader_kp": 3, "training_steps": 0}
+METADATA_VALUES = {"gravity": 0, "control_period": 0, "action_reach": 2, "leader_kp": 3, "training_steps": 0}
 
 
 def policies() -> dict[str, Content]:
@@ -96,7 +96,7 @@ def policies() -> dict[str, Content]:
         "a card of 100 000 brackets": _changed(lambda text: "[" * 100_000),
         **{
             f"{field} {told}": _edited(field, [number] * count if count else number)
-            for field, count in CARD_NUMBERS.items()
+            for field, count in METADATA_VALUES.items()
             for told, number in (("of 401 digits", 10**400), ("1e-320", 1e-320), ("1e300", 1e300))
         },
         "flown for 1e-320 s": _edited("flown", {"drones": [2], "seconds": 1e-320}),

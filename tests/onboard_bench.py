@@ -16,7 +16,7 @@ import pytest
 import onboard
 from mjxball.export import in_team
 from mjxball.policy import PolicyFile, load_file
-from mjxball.policy.file import law_of, shipped_policy
+from mjxball.policy.file import controller_of, shipped_policy
 from mjxfly.app import host, protocol
 from mjxfly.app.host import App, Library, OnboardState, compile_pair
 from mjxfly.app.protocol import CAUSES, AppPhase
@@ -38,12 +38,12 @@ def policy_of(name: str) -> PolicyFile:
     policy = load_file(shipped_policy(name))
     if name != "universal":
         return policy
-    return in_pair(dataclasses.replace(policy, card={**policy.card, "command_limits": [0.26, 0.4]}))
+    return in_pair(dataclasses.replace(policy, metadata={**policy.metadata, "command_limits": [0.26, 0.4]}))
 
 
 def in_pair(policy: PolicyFile) -> PolicyFile:
     """Told that it flies a pair of Crazyflies, if it has to be told."""
-    return in_team(policy, "follower", Path("crazyflie")) if law_of(policy.card).geometry else policy
+    return in_team(policy, "follower", Path("crazyflie")) if controller_of(policy.metadata).geometry else policy
 
 
 @functools.cache

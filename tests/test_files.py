@@ -15,7 +15,7 @@ from command_line import REPOSITORY, environment
 from mjxball.config import Config, read_plant, with_plant
 from mjxball.errors import InputError
 from mjxball.evaluate.scenarios import read_waveform
-from mjxball.files import MissingFileError, read_bytes, read_text, write_whole
+from mjxball.files import MissingFileError, read_bytes, read_text, write_atomically
 from mjxball.policy import load_file
 from mjxball.train.run_directory import file_hash, read_config, read_json, read_rows
 from mjxball.view.flight import flight_from, load_flight
@@ -83,13 +83,13 @@ def test_whoever_reads_sees_one_of_the_files_that_several_write(tmp_path: Path) 
     """A writer that opened the file itself, or one temporary file for all, would show a mixture or a part."""
     path, size = tmp_path / "shared", 300_000
     contents = [bytes([65 + number]) * size for number in range(3)]
-    write_whole(path, contents[0])
+    write_atomically(path, contents[0])
     done, faults = threading.Event(), list[str]()
 
     def write(content: bytes) -> None:
         try:
             for _ in range(40):
-                write_whole(path, content)
+                write_atomically(path, content)
         except OSError as error:
             faults.append(str(error))
 
@@ -128,7 +128,7 @@ def test_contents_are_on_disk_before_the_name_and_the_name_thereafter(
 
     monkeypatch.setattr(os, "fsync", note)
     monkeypatch.setattr(Path, "replace", renamed)
-    write_whole(path, "new")
+    write_atomically(path, "new")
     assert seen == [("content", b"old"), ("name", b"new"), ("folder", b"new")]
 
 
@@ -141,7 +141,7 @@ def test_a_full_disk_keeps_the_old_file_and_names_it(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space") as failed:
-        write_whole(path, b"new")
+        write_atomically(path, b"new")
     assert failed.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert [one.name for one in tmp_path.iterdir()] == ["kept"]

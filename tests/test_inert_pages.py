@@ -51,10 +51,10 @@ def test_a_report_of_a_follower_with_a_hostile_name(browser: Any, tmp_path: Path
         config, [make_baseline("copy", config)], [dataclasses.replace(suite, variants=(short,))], 1, "newton-euler"
     )
     for label, text in (("plain", "plain"), ("hostile", TEXT)):
-        cut, card = dataclasses.replace(short, label=text), load_file(shipped_policy("paper"))
+        cut, metadata = dataclasses.replace(short, label=text), load_file(shipped_policy("paper"))
         own = dataclasses.replace(suite, name=text, about=text, axis=text, variants=(cut, cut))
         scores = [dataclasses.replace(score, follower=text, suite=text, variant=text) for score in flown]
-        policy = Policy(dataclasses.replace(card, card={**card.card, "preset": text, text: text}), text)
+        policy = Policy(dataclasses.replace(metadata, metadata={**metadata.metadata, "preset": text, text: text}), text)
         write_report(tmp_path / label, config.plant, scores, [own], [policy], f"eval.py {text}", {text: text})
         tab = pages[label] = opened(browser, tmp_path / label / "report.html", 1280)
         assert tab.title() == "Benchmark of followers"
@@ -74,7 +74,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path, contents = tmp_path_factory.mktemp("log") / f"{NAME}.jsonl", untrained("flight")
     with Journal(path, **log_header(contents, TEXT)) as notes:
         settings = FlightSettings(seconds=1.0, goal=(0.1, 0.0, 0.4))
-        world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.card), log=notes)
+        world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.metadata), log=notes)
         world.fly_until(FlightState.DONE)
         notes.note("refused", text=TEXT)
     return path

@@ -44,7 +44,7 @@ def test_reprs_are_short_and_have_a_picture(config: Config) -> None:
     flight = simulate(config, copy, Scenario(seconds=1.0), "newton-euler")
     both = simulate_batch(config, [(copy, [Scenario(seconds=1.0), Scenario(seconds=1.0, omega=1.0)])], "newton-euler")
     policy = Policy.load(shipped_policy("balance"))
-    curve = policy.card["curve"]
+    curve = policy.metadata["curve"]
     for shown, words, kind, count in (
         (flight, "<Trajectory 1 s, 51 steps>", "polyline", 3),
         (both, "<Trajectory 1 s, 51 steps, 2 flights>", "polyline", 2),

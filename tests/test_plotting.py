@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from mjxball.baselines import LAWS
+from mjxball.baselines import CONTROLLERS
 from mjxball.plotting import (
     COLOURS,
     FREE,
@@ -118,7 +118,7 @@ def test_colours_are_seen_on_light_and_dark_pages() -> None:
 
 
 def test_every_follower_that_has_a_name_has_a_look() -> None:
-    assert {*LAWS, *(path.stem for path in shipped_policies())} <= set(LOOKS)
+    assert {*CONTROLLERS, *(path.stem for path in shipped_policies())} <= set(LOOKS)
     shared = follower_styles(LOOKS)
     assert all(follower_styles([name])[name] == shared[name] for name in LOOKS)
     named = follower_styles(["flight, flown", "balance (FORCED)", SIMULATED])

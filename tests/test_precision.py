@@ -12,7 +12,7 @@ from jax.extend import core
 from tables import rows
 
 from mjxball import config as configs
-from mjxball.baselines import LAWS, make_baseline
+from mjxball.baselines import CONTROLLERS, make_baseline
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
@@ -79,12 +79,12 @@ def test_laws_do_not_round_their_products() -> None:
         policy, config = Policy.load(path), native_config(path) or configs.preset("paper")
         policy.join(config.plant)
         followers = () if config.plant.count == 2 else (config.plant.count - 1,)
-        law, seen = policy.law, jnp.full((*followers, 18), 0.01)
-        memory = jnp.asarray(law.start(seen))
-        count, default = rounded(law.answer, memory, seen)
+        controller, seen = policy.controller, jnp.full((*followers, 18), 0.01)
+        memory = jnp.asarray(controller.start(seen))
+        count, default = rounded(controller.answer, memory, seen)
         assert count > 1, path
         assert default == 0, path
-        slope = jax.grad(lambda seen, memory, law=law: law.answer(memory, seen)[1].sum())
+        slope = jax.grad(lambda seen, memory, controller=controller: controller.answer(memory, seen)[1].sum())
         assert rounded(slope, seen, memory)[0] > count, path
         assert rounded(slope, seen, memory)[1] == 0, path
 
@@ -96,11 +96,11 @@ def test_baselines_do_not_round_their_products() -> None:
         seen, one = jnp.full((*followers, 18), 0.01), jnp.ones(followers)
         two = one if not followers else jnp.ones((*followers, 2))
         known = PrivilegedInfo(0.2 * one, 0.01 * two, 0.0 * two, 2.2 * one, jnp.ones((*followers, config.plant.count)))
-        for name in LAWS:
+        for name in CONTROLLERS:
             try:
-                law: Any = make_baseline(name, config).law
-                state = law.start(seen)
-                count, default = rounded(law.step, state, seen, known)
+                controller: Any = make_baseline(name, config).controller
+                state = controller.start(seen)
+                count, default = rounded(controller.step, state, seen, known)
             except (InputError, jax.errors.TracerArrayConversionError):
                 continue  # of another plant, or NumPy's alone
             assert default == 0, (preset, name)

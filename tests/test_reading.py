@@ -84,7 +84,7 @@ def run_of(place: Path) -> None:
     read_config(place)
 
 
-def card_of(place: Path) -> None:
+def metadata_of(place: Path) -> None:
     with np.load(shipped_policy("balance")) as stored:
         arrays: dict[str, Any] = dict(stored)
     arrays["card"] = np.array(twice(str(arrays["card"]), "bounds"))
@@ -92,7 +92,7 @@ def card_of(place: Path) -> None:
     load_file(place / "policy.npz")
 
 
-@rows("read", [plant_of, gains_of, sweep_of, run_of, card_of])
+@rows("read", [plant_of, gains_of, sweep_of, run_of, metadata_of])
 def test_every_file_with_a_key_twice_is_refused(read: Callable[[Path], None], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="stands twice"):
         read(tmp_path)

@@ -12,13 +12,13 @@ from typing import Any
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly import lift, setpoints
-from mjxfly.card import config_of
 from mjxfly.limits import STAND_SPARE, Limits, Times
 from mjxfly.log_schema import KINDS
 from mjxfly.log_sources import HEADER, RECORD, TOPICS, VARIABLES
 from mjxfly.main import make_parser
 from mjxfly.mocap_supervision import MocapLimits
 from mjxfly.packets import THRUST_CEILING, THRUST_FLOOR
+from mjxfly.policy_setup import config_of
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import TRANSITIONS, Event, FlightState
 from mjxfly.twin.conditions import FAULT_KINDS, Conditions
@@ -72,7 +72,7 @@ def flags() -> str:
 
 def bounds() -> str:
     """What ends a flight, and how long its parts last."""
-    limits, times, law = Limits(), Times(), CommandMap()
+    limits, times, controller = Limits(), Times(), CommandMap()
     rows = {
         "age of a state": f"{1000 * limits.state_age:.0f} ms",
         "fence around the start": f"±{limits.fence_high[0]:g} m, "
@@ -87,7 +87,7 @@ def bounds() -> str:
         "missed deadlines in a second": f"{limits.missed_deadlines}",
         "gap between two ticks": f"{1000 * limits.longest_gap:.0f} ms",
         "height above the goal, on a stand": f"{100 * STAND_SPARE:.0f} cm",
-        "sent roll and pitch": f"±{math.degrees(law.tilt_limit):.0f} degrees",
+        "sent roll and pitch": f"±{math.degrees(controller.tilt_limit):.0f} degrees",
         "sent thrust": f"{THRUST_FLOOR} .. {THRUST_CEILING} units",
         "ramp to hover": f"{times.ramp:g} s, and at most {times.lift:g} s more until the pair is off the ground",
         "landing speed of the goal": f"{times.land_speed:g} m/s",
@@ -112,7 +112,7 @@ def loads() -> str:
     """What each shipped policy for two Crazyflies carries on the twin."""
     lines = ["| policy | object [g] | CG on the twin |", "|---|---|---|"]
     for name in ("flight", "flight-upgrade", "flight-brushless", "stand"):
-        config = config_of(Policy.load(shipped_policy(name)).card)
+        config = config_of(Policy.load(shipped_policy(name)).metadata)
         met = Conditions.of(config)
         moves = f"a sine of {1000 * met.cg_amplitude:.0f} mm at {met.cg_speed:g} rad/s"
         if config.motion.kind == "rolling":

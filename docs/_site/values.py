@@ -40,7 +40,12 @@ from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
 
 MODULES = (  # known by their last name
     *("cells", "horizon", "rigs", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
-    *("mjxball.control.follower_law", "mjxball.control.motors", "mjxball.evaluate.metrics", "mjxball.physics.engine"),
+    *(
+        "mjxball.control.follower_controller",
+        "mjxball.control.motors",
+        "mjxball.evaluate.metrics",
+        "mjxball.physics.engine",
+    ),
     *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),
     *("mjxball.train.program", "mjxfly.app.protocol", "mjxfly.view.live"),
     *(f"mjxfly.{name}" for name in ("card", "measured", "monitor", "positioning", "preflight", "probe", "setpoints")),

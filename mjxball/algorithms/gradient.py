@@ -135,7 +135,7 @@ class FirstOrderGradient:
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: TrainingPhase) -> tuple[Any, Any]:
         """One window of all environments and its gradient. The first window gives the observations' statistics."""
         environments = self._environments
-        begins = starts_anew(environments.turn, state.windows, self._config.windows_per_episode)
+        begins = begins_episode(environments.turn, state.windows, self._config.windows_per_episode)
         envs = environments.restart(envs, keys[0], begins & phase.recording)
         # Where possible, differentiate by the initial states too: JAX then knows which carries have a gradient.
         arguments = (0, 2) if environments.smooth else (0,)
@@ -272,7 +272,7 @@ class FirstOrderGradient:
             )
 
 
-def starts_anew(turn: Any, windows: Any, lengths: Sequence[int]) -> Any:
+def begins_episode(turn: Any, windows: Any, lengths: Sequence[int]) -> Any:
     """(count,) which environments begin an episode after `windows` windows of training.
 
     `turn` (count,): `Environments.turn`. `lengths`: possible lengths of an episode [windows]. Neighbours have different

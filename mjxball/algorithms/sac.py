@@ -296,22 +296,22 @@ class SoftActorCritic:
     ) -> tuple[SacState, dict[str, Float[Array, ""]]]:
         """`updates_per_step` gradient steps, each on a batch from the replay."""
         rate = 1.0 + (self._config.learning_rate_final_ratio - 1.0) * progress
-        draws_key, noise_key = map(self._shards.own, keys)
+        batch_key, noise_key = map(self._shards.own, keys)
         zero = jnp.zeros(())
         learner, losses = jax.lax.cond(
             phase.learning,
-            lambda: self._learn(state, draws_key, noise_key, rate),
+            lambda: self._learn(state, batch_key, noise_key, rate),
             lambda: (state.learner, Losses(zero, zero, zero)),
         )
         report = (jnp.exp(learner.log_alpha), losses.entropy, losses.critic, losses.policy)
         return state._replace(learner=learner), dict(zip(self.metrics, report, strict=True))
 
     def _learn(
-        self, state: SacState, draws_key: Array, noise_key: Array, rate: Float[Array, ""]
+        self, state: SacState, batch_key: Array, noise_key: Array, rate: Float[Array, ""]
     ) -> tuple[Learner, Losses]:
         sac = self._config
         shape = (sac.updates_per_step, sac.batch_size // self._shards.parts)
-        draws = jax.random.bits(draws_key, shape, jnp.uint32)
+        draws = jax.random.bits(batch_key, shape, jnp.uint32)
         noise = jax.random.normal(noise_key, (shape[0], 2, shape[1], self._sizes[1]))
         batches = jax.vmap(
             lambda bits: replay.sample(

@@ -17,12 +17,12 @@ from mjxball.baselines.pid import Pid
 from mjxball.baselines.reference import Oracle, Random, Stay
 from mjxball.baselines.team_lqg import TeamOffsetFree
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Copy, Law
+from mjxball.control.followers import Baseline, Controller, Copy
 from mjxball.errors import InputError
 
 __all__ = [
     "BASELINES",
-    "LAWS",
+    "CONTROLLERS",
     "SUITE_BASELINES",
     "Adaptive",
     "Copy",
@@ -39,10 +39,10 @@ __all__ = [
     "SlowLqg",
     "Stay",
     "make_baseline",
-    "make_law",
+    "make_controller",
 ]
 
-LAWS: dict[str, Callable[[Config], Law]] = {
+CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "stay": Stay,
     "random": Random,
     "copy": Copy,
@@ -59,18 +59,18 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "lqg-known-failures": KnownFailuresLqg,
 }
 # In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
-SUITE_BASELINES = tuple(name for name in LAWS if name not in ("lqg-known-failures", "mpc"))
+SUITE_BASELINES = tuple(name for name in CONTROLLERS if name not in ("lqg-known-failures", "mpc"))
 VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
 BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
 
 
-def make_law(name: str, config: Config) -> Law:
+def make_controller(name: str, config: Config) -> Controller:
     """The classical controller called `name` with gains that follow from `config`; InputError if unknown."""
-    if name not in LAWS:
-        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(LAWS)}")
-    return LAWS[name](config)
+    if name not in CONTROLLERS:
+        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(CONTROLLERS)}")
+    return CONTROLLERS[name](config)
 
 
 def make_baseline(name: str, config: Config) -> Baseline:
     """The classical follower called `name` for `config`, with its state; InputError if unknown."""
-    return Baseline(make_law(name, config), config)
+    return Baseline(make_controller(name, config), config)

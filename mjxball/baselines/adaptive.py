@@ -71,7 +71,7 @@ class Adaptive:
         self._mass_limit = followers * MASS_LIMIT
 
     def start(self, observation: Array) -> AdaptiveState:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         xp, observation = observation.__array_namespace__(), self._model.seen(observation)
         zero = xp.zeros_like(observation[..., 0])
         zeros = xp.zeros_like(observation[..., : len(self._model.axes)])
@@ -79,7 +79,7 @@ class Adaptive:
         return AdaptiveState(self._pid.start(observation), zeros, zeros, zeros, zero, error, error_rate, zero)
 
     def step(self, state: AdaptiveState, observation: Array, privileged: PrivilegedInfo) -> tuple[AdaptiveState, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp, model, axes = observation.__array_namespace__(), self._model, self._model.turned
         slope, first, second = (xp.asarray(gain, dtype=observation.dtype) for gain in self._gains)
         observation = model.seen(observation)
@@ -104,7 +104,7 @@ class Adaptive:
         tilt = correction[..., :2]
         if self._adapts_mass:
             tilt = xp.clip(tilt, -CORRECTION_LIMIT, CORRECTION_LIMIT)
-        lift = model.less_extra_lift(vertical[..., None] + correction[..., 2], tilt)
+        lift = model.without_extra_lift(vertical[..., None] + correction[..., 2], tilt)
         command = xp.concat([copied[..., None, :2] + tilt, lift[..., None]], axis=-1)
         return after, model.sent(clip_command(command, *self._limits))
 

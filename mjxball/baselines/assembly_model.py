@@ -115,7 +115,7 @@ class AssemblyModel(NamedTuple):
         x, y = xp.asarray(self.mounts.T, dtype=lift.dtype)
         return xp.stack([(lift * y).sum(axis=-1), -(lift * x).sum(axis=-1)], axis=-1)
 
-    def less_extra_lift(self, vertical: Array, trim: Array) -> Array:
+    def without_extra_lift(self, vertical: Array, trim: Array) -> Array:
         """`vertical` (...) [m/s2] less the extra lift of motors that hold the torques kp `trim` (..., 2) [rad]."""
         return vertical - self.extra_lift * sum((self.kp[axis] * trim[..., axis]) ** 2 for axis in (0, 1))
 
@@ -124,10 +124,10 @@ class CopiedPid:
     """The leader's PID on the follower's own observation; with the leader's integral each drone lifts its share."""
 
     def __init__(self, config: Config):
-        law = config.leader
-        self._pid = law.kp, law.kd, law.ki
+        controller = config.leader
+        self._pid = controller.kp, controller.kd, controller.ki
         self._pd = copy_gains(config)
-        self._band, self._period = law.integral_error_limit, config.timing.control_period
+        self._band, self._period = controller.integral_error_limit, config.timing.control_period
 
     def start(self, observation: Array) -> Any:
         """Integral (..., 3) [m s] at the first `observation` (..., 18); () if the leader has none."""

@@ -149,12 +149,12 @@ class CrazyflieLqg:
         self._error_bounds = self._bounds(("y", "height"), ERROR_LIMIT)
 
     def start(self, observation: Array) -> LqgState:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         zero = observation.__array_namespace__().zeros_like(observation[..., :2])
         return LqgState(self._filter.start(times(self._measurement, observation)), zero, self._pid.start(observation))
 
     def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp = observation.__array_namespace__()
         estimate = self._filter.corrected(state.expected, times(self._measurement, observation))
         estimate = _clip(estimate, self._state_bounds)
@@ -162,7 +162,7 @@ class CrazyflieLqg:
         change = times(self._change, xp.concat([near, state.command], axis=-1))
         command = _clip(state.command - change, self._limits)
         integral, copied = self._pid.step(state.integral, observation)
-        vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
+        vertical = self._assembly.without_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
         vertical = _clip(vertical, self._limits[1])
         sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
         return LqgState(self._filter.moved(estimate, command), command, integral), sent

@@ -129,11 +129,11 @@ class Memoryless(LqrFollower):
     name = "memoryless"
 
     def start(self, observation: Array) -> Any:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return ()
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp, model = observation.__array_namespace__(), self._model
         observation = model.seen(observation)
         desired = self._desired(observation)
@@ -162,7 +162,7 @@ class Lqg(LqrFollower):
         self._filter, self._measurement = found
 
     def start(self, observation: Array) -> Array:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return self._filter.start(times(self._measurement, self._model.seen(observation)))
 
     def estimate(self, state: Array, observation: Array) -> tuple[Array, Array, Array]:
@@ -171,7 +171,7 @@ class Lqg(LqrFollower):
         return x, x[..., 3:turns:5], x[..., -1] if self.tuning.lift_walk > 0.0 else 0.0
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         observation = self._model.seen(observation)
         x, torque, lift = self.estimate(state, observation)
         followed, given = self._plan(observation, self._desired(observation), torque, lift, privileged)
@@ -198,7 +198,7 @@ class OffsetFree(Lqg):
         self._mass = config.plant.object_mass
 
     def start(self, observation: Array) -> Array:
-        """See `Law.start`; the filter starts one period late."""
+        """See `Controller.start`; the filter starts one period late."""
         found = super().start(observation)
         return self._filter.moved(found, 0.0 * observation[..., :3])
 

@@ -170,13 +170,13 @@ class Mpc:
         return sum(program.failed for program in self._programs.values())
 
     def start(self, observation: Array) -> Array:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         found = dict(zip(MEASURED, self._measured(self._seen(observation)), strict=True))
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
         return joined([found.get(place, zero) for place in range(self._states)] + [zero] * (3 * self.delay))
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp, dtype, mass = observation.__array_namespace__(), observation.dtype, privileged.believed_mass
         observation = self._seen(observation)
         kind = xp.round(clipped(mass, 0.0, MASSES[-1]) / MASSES[1]).astype(int)

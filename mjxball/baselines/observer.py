@@ -52,11 +52,11 @@ class Observer:
         self._leader = copy_gains(config)
 
     def start(self, observation: Array) -> ObserverState:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return ObserverState(observation[..., 10], -observation[..., ERROR_RATE][..., 2])
 
     def step(self, state: ObserverState, observation: Array, privileged: PrivilegedInfo) -> tuple[ObserverState, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         gains, led, limits = self.gains, copy_command(observation, *self._leader), self._leader[-2:]
         error, velocity = observation[..., ERROR], observation[..., ERROR_RATE]
         turning = gains.torque_bandwidth * (observation[..., 10] - state.rate)  # disturbance [rad/s2]

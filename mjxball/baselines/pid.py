@@ -62,12 +62,12 @@ class Pid:
         self._leader = copy_gains(config)
 
     def start(self, observation: Array) -> PidState:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         zero = observation.__array_namespace__().zeros_like(observation[..., 4])
         return PidState(observation[..., 4], -observation[..., ERROR_RATE][..., 2], zero, zero)
 
     def step(self, state: PidState, observation: Array, privileged: PrivilegedInfo) -> tuple[PidState, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         gains, led, limits = self.gains, copy_command(observation, *self._leader), self._leader[-2:]
         error, velocity, most = observation[..., ERROR], observation[..., ERROR_RATE], gains.tilt_limit
         period = self._period

@@ -26,11 +26,11 @@ class Stay:
         pass
 
     def start(self, observation: Array) -> Any:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return ()
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         return state, observation.__array_namespace__().zeros_like(observation[..., :ACTION_SIZE])
 
 
@@ -45,12 +45,12 @@ class Random:
         self._commands = scale_action(actions, config.follower.action_scale_tilt, config.follower.action_scale_vertical)
 
     def start(self, observation: Array) -> Any:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         xp = observation.__array_namespace__()
         return (xp.zeros_like(observation[..., 0], dtype=xp.int32),)
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp = observation.__array_namespace__()
         (count,) = state
         return (count + 1,), xp.asarray(self._commands, dtype=observation.dtype)[count % RANDOM_COMMANDS]
@@ -73,11 +73,11 @@ class Oracle:
         self._model = assembly_model(config, self.name)
 
     def start(self, observation: Array) -> Any:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return self._pid.start(self._model.seen(observation))
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp, model = observation.__array_namespace__(), self._model
         state, copied = self._pid.step(state, model.seen(observation))
         weight = (model.gravity + copied[..., 2:]) * self._torques(privileged.moment)
@@ -85,7 +85,7 @@ class Oracle:
         trim = model.corrections(wrench, model.carried(model.of_flight(privileged.believed_mass)))
         ahead = len(model.own_mass) / model.followers / (model.of_flight(privileged.total_mass) * model.gravity)
         reaction = ahead[..., None] * self._torques(privileged.moment_acceleration)
-        vertical = model.less_extra_lift(copied[..., None, 2] + trim[..., 2], trim[..., :2])
+        vertical = model.without_extra_lift(copied[..., None, 2] + trim[..., 2], trim[..., :2])
         tilt = copied[..., None, :2] + trim[..., :2] + reaction[..., None, :]
         command = xp.concat([tilt, vertical[..., None]], axis=-1)
         return state, model.sent(clip_command(command, *self._limits))

@@ -80,7 +80,7 @@ class TeamOffsetFree:
         self.stiffness, self._damping = config.plant.count * model.kp[0], model.kd[0] / model.kp[0]
 
     def start(self, observation: Array) -> Array:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return self.filter.start(times(self._measurement, observation))
 
     def estimate(self, state: Array, observation: Array) -> tuple[Array, Array, Array]:
@@ -89,7 +89,7 @@ class TeamOffsetFree:
         return x, x[..., 3:10:5], x[..., -1]
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         xp, ratio = observation.__array_namespace__(), self.team.ratio
         x, load, lift = self.estimate(state, observation)
         led = copy_command(observation, *self._leader)

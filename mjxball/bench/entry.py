@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.bench import NAME, VERSION
-from mjxball.bench.followers import Make, checked
+from mjxball.bench.followers import FollowerFactory, checked
 from mjxball.bench.references import bars
-from mjxball.bench.success import are_met, summary
+from mjxball.bench.success import criteria_met, summary
 from mjxball.bench.tracks import FLIGHTS, TRACKS, worlds_of
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
@@ -31,7 +31,11 @@ VALUES = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "comm
 
 
 def run(
-    name: str, make: Make, tracks: Sequence[str], draw: int, progress: Callable[[str], None] = lambda text: None
+    name: str,
+    make: FollowerFactory,
+    tracks: Sequence[str],
+    draw: int,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """The entry of a follower, without the keys on the machine that `mjxball.commands` adds.
 
@@ -56,7 +60,7 @@ def run(
     return {**head, "tracks": results, "not_flown": refused}
 
 
-def measure(track: str, draw: int, make: Make, progress: Callable[[str], None]) -> dict[str, dict[str, Any]]:
+def measure(track: str, draw: int, make: FollowerFactory, progress: Callable[[str], None]) -> dict[str, dict[str, Any]]:
     """Results of the follower on `track`, by condition: undisturbed and disturbed.
 
     Raises InputError if it refuses the track's plants or fails the checks of `mjxball.bench.followers`.
@@ -70,7 +74,7 @@ def measure(track: str, draw: int, make: Make, progress: Callable[[str], None]) 
     for number, (world, follower) in enumerate(zip(worlds, entrants, strict=True)):
         progress(f"{track}: {number + 1}/{len(worlds)}")
         (mine,) = world.fly([follower], [one for pair in world.scenarios for one in pair])
-        flown, succeeded = [*flown, *mine], [*succeeded, *are_met(mine, bars(track, draw, number))]
+        flown, succeeded = [*flown, *mine], [*succeeded, *criteria_met(mine, bars(track, draw, number))]
     return {name: summary(flown[row::2], succeeded[row::2]) for row, name in enumerate(CONDITIONS)}
 
 

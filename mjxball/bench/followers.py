@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.baselines import LAWS
+from mjxball.baselines import CONTROLLERS
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError, said
-from mjxball.evaluate.followers import Make, answered, find_follower
+from mjxball.evaluate.followers import FollowerFactory, answered, follower_factory
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy, policy_path, shipped_policies
 
-__all__ = ["Make", "checked", "entrant"]
+__all__ = ["FollowerFactory", "checked", "entrant"]
 
 MAX_CALL_TIME = 0.020  # largest median time of CALLS consecutive calls for one flight [s]
 CALLS = 20
@@ -26,10 +26,10 @@ TYPES = {"observation": "tensor(float)", "memory": "tensor(float)", "start": "te
 UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # with privileged information, or no controllers
 
 
-def entrant(text: str) -> tuple[str, Make]:
+def entrant(text: str) -> tuple[str, FollowerFactory]:
     """(name, function that makes it for a plant) of the follower that `text` names; InputError if there is none.
 
-    `text` is POLICY.npz or the name of a shipped one, MODEL.onnx, or what `evaluate.followers.find_follower` finds.
+    `text` is POLICY.npz or the name of a shipped one, MODEL.onnx, or what `evaluate.followers.follower_factory` finds.
     """
     path = policy_path(text)
     if path.suffix == ".npz":
@@ -40,12 +40,15 @@ def entrant(text: str) -> tuple[str, Make]:
         return path.stem, lambda config: OnnxFollower(path.stem, session)
     if text in UNRANKED:
         raise InputError(f"{text} is not ranked: it uses information that no follower can have, or is no controller")
-    if text not in LAWS and ":" not in text:
-        names = [*(shipped.stem for shipped in shipped_policies()), *(name for name in LAWS if name not in UNRANKED)]
+    if text not in CONTROLLERS and ":" not in text:
+        names = [
+            *(shipped.stem for shipped in shipped_policies()),
+            *(name for name in CONTROLLERS if name not in UNRANKED),
+        ]
         raise InputError(
             f"the benchmark flies a file .npz or .onnx, module:Class, or one of {', '.join(names)}, not {text!r}"
         )
-    return find_follower(text, "follower")
+    return follower_factory(text, "follower")
 
 
 def _loaded(path: Path, config: Config) -> Policy:
@@ -119,7 +122,7 @@ def _session(path: Path) -> Any:
     return session
 
 
-def checked(make: Make, config: Config, calls: int = CALLS) -> Follower:
+def checked(make: FollowerFactory, config: Config, calls: int = CALLS) -> Follower:
     """`make(config)`, after `calls` for a flight at rest; InputError if they are too slow or return no command."""
     follower, count = make(config), len(config.plant.followers)
     shape = (1, OBSERVATION_SIZE) if count == 1 else (1, count, OBSERVATION_SIZE)

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mjxball.baselines import LAWS
+from mjxball.baselines import CONTROLLERS
 from mjxball.bench.curves import flight_curves, heat_maps, variant_curves
 from mjxball.bench.scores import RANKED, Score, Summary, by_variant, winners, wins
 from mjxball.bench.suites import GRID, Suite
 from mjxball.config import Plant
 from mjxball.evaluate.render import film
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.policy import Policy
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -62,7 +62,7 @@ def write_report(
     }
     write_page("report.html", out / "report.html", context, policies, command, versions)
     records = {"command": command, "scores": [score.record() for score in scores]}
-    write_whole(out / "scores.json", json.dumps(records, indent=1, allow_nan=False) + "\n")
+    write_atomically(out / "scores.json", json.dumps(records, indent=1, allow_nan=False) + "\n")
 
 
 def write_page(
@@ -79,13 +79,15 @@ def write_page(
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    metadata = {p.name: {key: value for key, value in p.card.items() if key not in HIDDEN_METADATA} for p in policies}
+    metadata = {
+        p.name: {key: value for key, value in p.metadata.items() if key not in HIDDEN_METADATA} for p in policies
+    }
     made = {
         "command": command,
         "versions": json.dumps(dict(versions), indent=1),
         "metadata": {name: json.dumps(one, indent=1, default=str) for name, one in metadata.items()},
     }
-    write_whole(path, environment.get_template(template).render(**context, **made))
+    write_atomically(path, environment.get_template(template).render(**context, **made))
 
 
 def verdict(scores: Sequence[Score]) -> dict[str, Any]:
@@ -140,7 +142,7 @@ def lead_picture(plant: Plant, scores: Sequence[Score], policies: Sequence[str])
     first = next(iter(by_variant(scores).values()))
     flown = [score.follower for score in first]
     count = {name: number for name, number in wins(scores).items() if name in flown}
-    classical = [name for name in count if name in LAWS and name not in ("copy", "stay", "random")]
+    classical = [name for name in count if name in CONTROLLERS and name not in ("copy", "stay", "random")]
     trained = [name for name in count if name in policies]
     best = [max(names, key=lambda name: count[name]) for names in (trained, classical) if names]
     wanted = ["copy", *best]

@@ -49,7 +49,7 @@ def bar(best: np.ndarray, length: float = 1.0) -> np.ndarray:
     return np.stack([*limits(dict(zip(BOUNDS, best.T, strict=True)), BOUNDS, length).values()], axis=1)
 
 
-def are_met(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
+def criteria_met(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
     """Whether each flight succeeds, of `bars` (flights, 3)."""
     return [
         not metrics.failed and bool((np.array(numbers(metrics)) <= most).all())

@@ -20,7 +20,7 @@ from mjxball.evaluate.metrics import Metrics, fly_and_measure
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude, largest_margin
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rigs import draw_rigs, rig_config, unpadded
+from mjxball.sim.rigs import rig_config, sample_rigs, unpadded
 from mjxball.sim.scenario import CgPath, Scenario
 
 ENGINE = "newton-euler"
@@ -143,7 +143,7 @@ def _rigs(draw: int) -> list[World]:
     worlds, random, base = [], _random(draw, 3), preset("universal")
     each = FLIGHTS // (EACH_RIG * len(RIGS))  # rigs of a size
     for size in RIGS:
-        rigs = unpadded(draw_rigs(base, size, each, 1000 + draw).rigs, size)
+        rigs = unpadded(sample_rigs(base, size, each, 1000 + draw).rigs, size)
         for row in range(each):
             config = rig_config(base, rigs, row)
             scenarios = []

@@ -9,7 +9,7 @@ from pathlib import Path
 from mjxball import cli
 from mjxball.bench.tracks import TRACKS
 from mjxball.commands.followers import clock
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.train.run_directory import commit, versions
 
 
@@ -33,6 +33,6 @@ def run(options: argparse.Namespace, command: str) -> int:
     name, make = entrant(options.follower)
     entry = fly(name, make, options.tracks, options.draw, clock())
     origin = {"command": command, "commit": commit(), "versions": versions()}
-    write_whole(options.out, json.dumps({**entry, **origin}, indent=1, allow_nan=False) + "\n")
+    write_atomically(options.out, json.dumps({**entry, **origin}, indent=1, allow_nan=False) + "\n")
     print(f"{table(entry)}\nthe entry is {options.out}")
     return 0

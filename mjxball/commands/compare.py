@@ -22,7 +22,7 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import fly_scenarios, table
     from mjxball.policy.file import load_file, save_file
-    from mjxball.train.curves import POLICIES, draw_members
+    from mjxball.train.curves import POLICIES, plot_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
     reference = standard_scenarios(settings)[0]
@@ -33,8 +33,8 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
     seeds = [int(result.follower.removeprefix("seed")) for result in results]
     spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in results] for name in compared}
     spread["failed"] = [result.metrics.failed for result in results]
-    card = {**exported.card, "population": {"seed": seeds, **spread}}
-    save_file(out / POLICY, dataclasses.replace(exported, card=card))
+    metadata = {**exported.metadata, "population": {"seed": seeds, **spread}}
+    save_file(out / POLICY, dataclasses.replace(exported, metadata=metadata))
     for name in compared:
         values = sorted(math.inf if value is None else value for value in spread[name])
         summary = (statistics.median(values), values[0], values[-1])
@@ -42,7 +42,7 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
         middle, low, high = (missing if math.isinf(value) else f"{value:.4g}" for value in summary)
         print(f"{name}: median {middle}, best {low}, worst {high} of {len(values)}")
     (out / "eval").mkdir(exist_ok=True)
-    draw_members(out, out / "eval" / "members.png")
+    plot_members(out, out / "eval" / "members.png")
 
 
 def _seed_of(path: Path) -> int:

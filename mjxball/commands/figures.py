@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 
 from mjxball import cli
-from mjxball.baselines import LAWS
+from mjxball.baselines import CONTROLLERS
 from mjxball.bench.report import MADE, write_page
 from mjxball.commands.followers import add_flight, add_policies, clock, load, refuse_same_names
 from mjxball.config import Config, preset
 from mjxball.evaluate import paper_figures
 from mjxball.evaluate.policies import native_config
 from mjxball.evaluate.stand_figure import stand_config
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.plotting import STYLES
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policies
@@ -38,16 +38,16 @@ def run(options: argparse.Namespace, command: str) -> int:
     cli.output_directory(options.out)
     paths = options.policies or [path for path in shipped_policies() if _setup_of(path)]
     policies = load(paths, lambda path: _setup_of(path) or preset("paper"), options.force)
-    refuse_same_names([*LAWS, *(policy.name for policy in policies)])
+    refuse_same_names([*CONTROLLERS, *(policy.name for policy in policies)])
     paper_figures.check_figures(names, policies)
     figures, say = [], clock()
     for name in names:
-        figures.append(paper_figures.draw_figure(name, policies, options.physics, options.style))
+        figures.append(paper_figures.plot_figure(name, policies, options.physics, options.style))
         say(f"figure {name}")
     options.out.mkdir(parents=True, exist_ok=True)
     ending = STYLES[options.style]["savefig.format"]
     for figure in figures:
-        write_whole(options.out / f"figure-{figure.name}.{ending}", figure.picture)
+        write_atomically(options.out / f"figure-{figure.name}.{ending}", figure.picture)
     page = options.out / "figures.html"
     links = [*((figure.name, figure.title) for figure in figures), MADE]
     context = {

@@ -19,8 +19,8 @@ from mjxball.errors import InputError
 from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
-from mjxball.evaluate.scenarios import rig_line, standard_scenarios
-from mjxball.files import write_whole
+from mjxball.evaluate.scenarios import rig_summary, standard_scenarios
+from mjxball.files import write_atomically
 from mjxball.plotting import STYLES
 from mjxball.policy import Policy
 from mjxball.sim.scenario import Scenario
@@ -89,9 +89,9 @@ class Group:
     def policies(self, options: argparse.Namespace) -> list[Policy]:
         """The policies, loaded for the plant. Raises InputError if `--check` is given and one has no bounds."""
         # --wn-pitch changes the attitude loops on purpose, so they may differ from the policy's.
-        longest, compare_laws = max(scenario.seconds for scenario in self.scenarios), options.wn_pitch is None
-        policies = load(self.followers.paths, lambda path: self.setup, options.force, compare_laws, longest)
-        unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
+        longest, compare_controllers = max(scenario.seconds for scenario in self.scenarios), options.wn_pitch is None
+        policies = load(self.followers.paths, lambda path: self.setup, options.force, compare_controllers, longest)
+        unbounded = [policy.name for policy in policies if options.check and not policy.metadata["bounds"]]
         if unbounded:
             raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
         return policies
@@ -121,7 +121,7 @@ def run(options: argparse.Namespace, command: str) -> int:
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")
         if options.plant or group.setup.plant != config.Plant():
-            print(rig_line(group.setup, max(scenario.mass for scenario in group.scenarios)))
+            print(rig_summary(group.setup, max(scenario.mass for scenario in group.scenarios)))
         print(table(results, standard_scenarios(group.setup)[0]))
         if not number or groups[0].followers.asked:  # without arguments the JSON holds the paper's plant alone
             written += results
@@ -134,7 +134,7 @@ def run(options: argparse.Namespace, command: str) -> int:
         if options.check:
             code = max(code, _check(group.setup, policies, results, options.physics))
     if options.json:
-        write_whole(options.json, to_json(written))
+        write_atomically(options.json, to_json(written))
     return code
 
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mjxball.baselines import LAWS
+from mjxball.baselines import CONTROLLERS
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
-from mjxball.evaluate.followers import Make, find_follower
+from mjxball.evaluate.followers import FollowerFactory, follower_factory
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy
@@ -28,7 +28,7 @@ def add_policies(parser: argparse.ArgumentParser) -> None:
 
 def add_followers(parser: argparse.ArgumentParser) -> None:
     """Add the flag of a command that flies other followers too."""
-    about = f"baselines: {', '.join(LAWS)}; or module:Class, your own"
+    about = f"baselines: {', '.join(CONTROLLERS)}; or module:Class, your own"
     parser.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=about)
 
 
@@ -62,15 +62,15 @@ def named(options: argparse.Namespace) -> Named:
     return Named(names, files if asked else shipped_policies(), asked)
 
 
-def _maker(name: str) -> Make:
-    return find_follower(name, "--followers")[1]
+def _maker(name: str) -> FollowerFactory:
+    return follower_factory(name, "--followers")[1]
 
 
 def load(
     paths: Sequence[Path],
     setup_of: Callable[[Path], Config],
     force: bool,
-    compare_laws: bool = True,
+    compare_controllers: bool = True,
     seconds: float = 0.0,
 ) -> list[Policy]:
     """The policies, each loaded for the configuration `setup_of` its path, for flights of up to `seconds` [s].
@@ -83,7 +83,7 @@ def load(
         setup, policy = setup_of(path), Policy.load(path)
         policy.join(setup.plant)
         try:
-            policy = load_policy(path, setup, compare_laws, seconds)
+            policy = load_policy(path, setup, compare_controllers, seconds)
         except InputError as error:
             if not force:
                 raise InputError(f"{error}; --force flies it all the same") from None

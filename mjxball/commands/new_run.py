@@ -89,7 +89,7 @@ def check_packages() -> None:
 
 
 @contextlib.contextmanager
-def emptied_unless_begun(out: Path, errors: type[Exception] | tuple[()]) -> Iterator[Callable[[], None]]:
+def clean_up_unless_begun(out: Path, errors: type[Exception] | tuple[()]) -> Iterator[Callable[[], None]]:
     """Empty the new `out` if one of `errors` is raised before the function that this yields is called.
 
     Training calls it when it begins. After an earlier error the same command can be given again.
@@ -214,7 +214,7 @@ def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     return settings, origin
 
 
-def refuse_beside(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
+def refuse_new_run_options(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
     """Raise InputError, which begins with `why`, for options of a new run other than `but`."""
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
     names = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)

@@ -15,7 +15,7 @@ from mjxball.commands.followers import add_flight, add_followers, add_policies, 
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import group_by_plant
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.train.run_directory import versions
 
 
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace, command: str) -> int:
     scores = run_benchmark(setup, followers, suites, options.num_seeds, options.physics, clock())
     print(text_table(scores, suites))
     if options.json:
-        write_whole(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
+        write_atomically(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
         write_report(options.out, setup.plant, scores, suites, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")

@@ -20,21 +20,21 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.commands.compare import compare, compare_members, compile_ahead, is_evaluated
 from mjxball.commands.new_run import (
     check_packages,
-    emptied_unless_begun,
+    clean_up_unless_begun,
     new_run,
     output_directory,
     recorded,
-    refuse_beside,
+    refuse_new_run_options,
     wake_devices,
 )
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
-from mjxball.evaluate.scenarios import rig_line
+from mjxball.evaluate.scenarios import rig_summary
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
 from mjxball.terminal import say, warn
 from mjxball.train import processes, shares
-from mjxball.train.curves import draw_training
+from mjxball.train.curves import plot_training
 from mjxball.train.run_directory import CHECKPOINTS, POLICY
 from mjxball.xla import check_address_space, enable_compilation_cache
 
@@ -136,7 +136,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     # Preallocating three quarters of a large GPU's memory takes 1.6 s. Allocation on demand trains as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if options.resume is not None:
-        refuse_beside(options, "--resume continues with the run's own configuration", ())
+        refuse_new_run_options(options, "--resume continues with the run's own configuration", ())
         out, (settings, origin) = options.resume, recorded(options.resume)
     else:
         settings, origin, out = new_run(options, command)
@@ -155,13 +155,13 @@ def _train(options: argparse.Namespace, command: str) -> int:
             writes = not rendezvous or processes.is_writer()  # `is_writer` waits until the devices have started
             # A run of several processes of which one is lost is continued with --resume, so its files stay.
             undone = () if resume or not writes else InputError if rendezvous else Exception
-            begun = hold.enter_context(emptied_unless_begun(out, undone))
+            begun = hold.enter_context(clean_up_unless_begun(out, undone))
             with ThreadPoolExecutor(1) as pool:
 
                 def prepare() -> None:
                     begun()
                     if writes and options.plant:
-                        warn(rig_line(settings))
+                        warn(rig_summary(settings))
                     if writes and is_evaluated(origin):
                         pool.submit(compile_ahead, settings, origin["physics"])
 
@@ -181,7 +181,7 @@ def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: in
     print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)
     if code:
         return code
-    draw_training(out, settings, out / "eval" / "training.png")
+    plot_training(out, settings, out / "eval" / "training.png")
     if not is_evaluated(origin):
         return 0
     if origin["seeds"] > 1:
@@ -244,7 +244,7 @@ def _rendezvous(options: argparse.Namespace) -> processes.Rendezvous | None:
 
 def _gather(options: argparse.Namespace) -> int:
     """Join the runs of a population's parts and compare its members, as one run of all would do."""
-    refuse_beside(options, "--gather takes runs as they are", ("out",))
+    refuse_new_run_options(options, "--gather takes runs as they are", ("out",))
     if options.resume or options.distributed or options.out is None:
         raise InputError("--gather RUN ... needs --out DIR, a new directory, and neither --resume nor --distributed")
     output_directory(options.out)

@@ -200,7 +200,7 @@ def _check_leader(config: Config) -> None:
     Checked are the poles at hover: horizontal motion by gravity's share at a tilt, vertical motion by thrust with the
     rotors' lag. A small integral gain makes a slow pole, so decay is checked without the integral.
     """
-    law, loop, lag = config.leader, config.attitude, max(config.plant.of_drones("rotor_lag"))
+    controller, loop, lag = config.leader, config.attitude, max(config.plant.of_drones("rotor_lag"))
     free = config.plant.stand == "free"
     ways = {"x": (0, "pitch"), "y": (1, "roll")} if free else {}
     ways |= {"z": (2, "")} if config.plant.stand != "pivot" else {}
@@ -214,14 +214,14 @@ def _check_leader(config: Config) -> None:
         elif turned:
             gain, below = getattr(config.autopilot, turned)[0], f"autopilot.{turned}"
             bottom = [1.0, gain]
-        top = bottom[-1] * np.array([law.kd[place], law.kp[place], law.ki[place]])
-        poles = np.roots(np.polyadd([*bottom, 0.0, 0.0, 0.0], top)) if law.ki[place] else np.zeros(0)
+        top = bottom[-1] * np.array([controller.kd[place], controller.kp[place], controller.ki[place]])
+        poles = np.roots(np.polyadd([*bottom, 0.0, 0.0, 0.0], top)) if controller.ki[place] else np.zeros(0)
         without = np.roots(np.polyadd([*bottom, 0.0, 0.0], top[:2]))
         if (poles.size and poles.real.max() >= 0) or without.real.max() >= -slowest:
             raise InputError(
-                f"leader.kp, kd, ki {law.kp[place]:g}, {law.kd[place]:g}, {law.ki[place]:g} along {axis} do not hold "
-                f"the object with this {below}: the loop that they close is unstable, or takes more than "
-                f"{LONGEST_ERROR:g} s to forget an error"
+                f"leader.kp, kd, ki {controller.kp[place]:g}, {controller.kd[place]:g}, {controller.ki[place]:g} along "
+                f"{axis} do not hold the object with this {below}: the loop that they close is unstable, or takes more "
+                f"than {LONGEST_ERROR:g} s to forget an error"
             )
 
 

@@ -31,7 +31,7 @@ class PrivilegedInfo(NamedTuple):
     thrust: Array | None = None  # (..., N) present factor on each drone's rotor forces; None: 1
 
 
-class Law(Protocol):
+class Controller(Protocol):
     """A follower's controller as two pure functions of arrays; `state` is a tuple of arrays (possibly empty)."""
 
     name: str
@@ -65,8 +65,8 @@ class Follower(Protocol):
 def checked_observation(observation: Array) -> np.ndarray:
     """`observation` (..., 18) as float64. Raises InputError that names the bad component if it is invalid.
 
-    Valid are finite real values with an absolute sum below `MAX_OBSERVATION`. A follower that filters observations would
-    otherwise carry one bad value for the rest of the flight.
+    Valid are finite real values with an absolute sum below `MAX_OBSERVATION`. A follower that filters observations
+    would otherwise carry one bad value for the rest of the flight.
     """
     given = real_numbers(observation, "an observation")
     if given.shape[-1:] != (OBSERVATION_SIZE,):
@@ -136,13 +136,13 @@ class OneThread:
 
 
 class Baseline:
-    """A `Law` with its state, for one flight of one thread at a time (see `OneThread`); `law` itself is pure.
+    """A `Controller` with its state, for one flight of one thread at a time (see `OneThread`); `law` itself is pure.
 
     Set `privileged` before a call; without it the mass of `config.plant` is assumed.
     """
 
-    def __init__(self, law: Law, config: Config):
-        self.law, self.name = law, law.name
+    def __init__(self, controller: Controller, config: Config):
+        self.controller, self.name = controller, controller.name
         self.privileged: PrivilegedInfo | None = None
         self._believed_mass = config.plant.object_mass
         self._state: Any = None
@@ -162,16 +162,16 @@ class Baseline:
         """See `Follower.__call__`. Raises InputError if the controller needs `privileged` and it is not set."""
         observation = checked_observation(observation)
         if self._state is None:
-            self._state, self._batch = self.law.start(observation), observation.shape[:-1]
+            self._state, self._batch = self.controller.start(observation), observation.shape[:-1]
         if not isinstance(self._state, tuple) or self._state:
             self._thread.check(self.name)
             check_batch(self.name, self._batch, observation)
         privileged = self.privileged or self._nominal(observation)
-        self._state, command = self.law.step(self._state, observation, privileged)
+        self._state, command = self.controller.step(self._state, observation, privileged)
         return command
 
     def _nominal(self, observation: Array) -> PrivilegedInfo:
-        if self.law.needs_privileged:
+        if self.controller.needs_privileged:
             raise InputError(f"follower {self.name!r} needs to know where the CG is; it flies in simulation only")
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
         return PrivilegedInfo(zero + self._believed_mass, zero, zero, zero)
@@ -187,11 +187,11 @@ class Copy:
         self._gains = copy_gains(config)
 
     def start(self, observation: Array) -> Any:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return ()
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         return state, copy_command(observation, *self._gains)
 
 

@@ -9,23 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.baselines import LAWS, make_baseline
+from mjxball.baselines import CONTROLLERS, make_baseline
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower, checked_command
 from mjxball.errors import FOREIGN, InputError, said
 
 MAX_COMMAND = 1e9  # of a command, in rad and m/s2; larger values soon overflow when squared
 PACKAGE = Path(__file__).parents[1]
-Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
+FollowerFactory = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
 
-def find_follower(text: str, flag: str) -> tuple[str, Make]:
+def follower_factory(text: str, flag: str) -> tuple[str, FollowerFactory]:
     """(name, function that makes it for a plant) of a classical follower or of the class `text` = module:Class.
 
-    The class is called with the `Config` and is a `mjxball.control.followers.Law` or a `Follower`. Raises InputError,
-    which names the flag `flag`, if there is none of that name.
+    The class is called with the `Config` and is a `mjxball.control.followers.Controller` or a `Follower`. Raises
+    InputError, which names the flag `flag`, if there is none of that name.
     """
-    if text in LAWS or ":" not in text:
+    if text in CONTROLLERS or ":" not in text:
         return text, lambda config: make_baseline(text, config)
     from mjxball.train.extensions import find  # with JAX
 
@@ -50,18 +50,18 @@ class UserFollower:
 
 
 class UserController:
-    """A user's `Law` whose answers are checked."""
+    """A user's `Controller` whose answers are checked."""
 
     def __init__(self, name: str, controller: Any):
         self.name, self._controller = name, controller
         self.needs_privileged = bool(_guarded(name, getattr, controller, "needs_privileged", False))
 
     def start(self, observation: Any) -> Any:
-        """See `Law.start`."""
+        """See `Controller.start`."""
         return _guarded(self.name, self._controller.start, observation, given=observation)
 
     def step(self, state: Any, observation: Any, privileged: Any) -> Any:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         answer = _guarded(self.name, self._controller.step, state, observation, privileged, given=observation)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise InputError(

@@ -16,7 +16,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate.plots import Figure, distance, panels, thinned
 from mjxball.evaluate.results import Result, fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE
-from mjxball.evaluate.stand_figure import draw_stand
+from mjxball.evaluate.stand_figure import plot_stand
 from mjxball.plotting import (
     INK,
     follower_styles,
@@ -46,18 +46,18 @@ LINEAR = 10.0  # returns nearer to 0 are plotted on a linear scale, the others o
 
 def on_stand(policy: Policy) -> bool:
     """Whether `policy` was made for the test stand."""
-    return policy.card["plant"].get("stand", "free") != "free"
+    return policy.metadata["plant"].get("stand", "free") != "free"
 
 
-def draw_figure(name: str, policies: Sequence[Policy], physics: str, look: str = "screen") -> Figure:
+def plot_figure(name: str, policies: Sequence[Policy], physics: str, look: str = "screen") -> Figure:
     """Fly and draw the figure `name` in the style `look`; see `check_figures`."""
     free = [policy for policy in policies if not on_stand(policy)]
     makers: dict[str, Callable[[], Figure]] = {
-        "reward": lambda: draw_reward(free or policies),
-        "adaptive": lambda: draw_adaptive(free, physics),
-        "speeds": lambda: draw_speeds(free, physics),
-        "masses": lambda: draw_masses(free, physics),
-        "stand": lambda: draw_stand([policy for policy in policies if on_stand(policy)], physics),
+        "reward": lambda: plot_reward(free or policies),
+        "adaptive": lambda: plot_adaptive(free, physics),
+        "speeds": lambda: plot_speeds(free, physics),
+        "masses": lambda: plot_masses(free, physics),
+        "stand": lambda: plot_stand([policy for policy in policies if on_stand(policy)], physics),
     }
     with style(look), pyplot().rc_context(FONTS if look == "screen" else {}):
         return makers[name]()
@@ -86,7 +86,7 @@ class Curve:
 
 def read_curve(policy: Policy) -> Curve | None:
     """The training curve of `policy`, None if its file has none; InputError if it is invalid."""
-    stored = policy.card.get("curve")
+    stored = policy.metadata.get("curve")
     if stored is None:
         return None
     named = ("steps", "episode_return", "eval_steps", "eval_return")
@@ -97,7 +97,7 @@ def read_curve(policy: Policy) -> Curve | None:
     return Curve(*columns)
 
 
-def draw_reward(policies: Sequence[Policy]) -> Figure:
+def plot_reward(policies: Sequence[Policy]) -> Figure:
     """Return of an episode during training, one panel per policy."""
     from matplotlib.ticker import EngFormatter
 
@@ -128,14 +128,14 @@ def draw_reward(policies: Sequence[Policy]) -> Figure:
     return Figure("reward", "Training", 2, rendered(figure), caption, heads, rows)
 
 
-def draw_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
+def plot_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
     """The policies, `copy` and `adaptive` on the reference scenario."""
     setup = configs.preset("paper")
     followers: list[Follower] = [make_baseline("copy", setup), make_baseline("adaptive", setup), *policies]
     results = fly_scenarios(setup, followers, [REFERENCE], physics)
     looks = follower_styles(result.follower for result in results)
     figure, axes = panels([1.3, 1.3, 1.3, 1.7])
-    _draw_flights([*axes[:, 0]], results, [{**line(looks[r.follower]), "label": r.follower} for r in results])
+    _plot_flights([*axes[:, 0]], results, [{**line(looks[r.follower]), "label": r.follower} for r in results])
     axes[-1, 0].set_xlabel("time [s]")
     legend_above(figure, axes[:1, 0])
     rows = []
@@ -159,7 +159,7 @@ def swings(error: np.ndarray) -> int:
     return sum(int(np.count_nonzero(np.diff(side))) for side in sides)
 
 
-def draw_speeds(policies: Sequence[Policy], physics: str) -> Figure:
+def plot_speeds(policies: Sequence[Policy], physics: str) -> Figure:
     """Flights with five CG speeds, one column per policy, and one for `copy`."""
     setup = configs.preset("paper")
     columns = _fly([*policies, make_baseline("copy", setup)], SPEEDS, physics)
@@ -170,7 +170,7 @@ def draw_speeds(policies: Sequence[Policy], physics: str) -> Figure:
     return _variations("speeds", "CG speeds", 4, columns, caption, ERROR_WINDOW)
 
 
-def draw_masses(policies: Sequence[Policy], physics: str) -> Figure:
+def plot_masses(policies: Sequence[Policy], physics: str) -> Figure:
     """Flights with several object masses: per policy a column of known masses and one of changes in flight."""
     known, changed = (_fly(policies, scenarios, physics) for scenarios in (MASSES, CHANGES))
     columns = [pair for both in zip(known, changed, strict=True) for pair in both]
@@ -205,7 +205,7 @@ def _variations(
         axis.set_visible(False)
     for k, (mine, (head, flown)) in enumerate(zip(places, columns, strict=True)):
         styles = [{**line(looks[label]), "linewidth": 1.0, "label": label} for label, _ in flown]
-        _draw_flights([*mine], [result for _, result in flown], styles, ahead)
+        _plot_flights([*mine], [result for _, result in flown], styles, ahead)
         mine[0].set_title(head)
         for axis in mine if k % across else []:
             axis.set_ylabel("")
@@ -234,7 +234,7 @@ def _final(result: Result) -> str:
     return "-" if result.metrics.failed else f"{np.linalg.norm(result.flight.error[-1]):.3f} m"
 
 
-def _draw_flights(
+def _plot_flights(
     axes: Sequence[Any], results: Sequence[Result], styles: Sequence[dict[str, Any]], ahead: float = 0.0
 ) -> None:
     """Plot x, y, z of O with the goal dotted into three panels, and its distance from the goal into a fourth."""
@@ -259,7 +259,7 @@ def _largest_ahead(error: np.ndarray, time: np.ndarray, ahead: float) -> np.ndar
 
 
 def _reward_kind(policy: Policy) -> str | None:
-    trained = policy.card.get("config")
+    trained = policy.metadata.get("config")
     reward = trained.get("reward") if isinstance(trained, dict) else None
     return reward.get("kind") if isinstance(reward, dict) else None
 

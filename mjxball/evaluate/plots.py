@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_title, to_json
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.plotting import (
     INK,
     file_format,
@@ -51,7 +51,7 @@ def distance(flight: Trajectory) -> np.ndarray:
     return np.maximum(1e3 * np.linalg.norm(flight.position - flight.target, axis=-1), LEAST_ERROR)
 
 
-def draw_flights(
+def plot_flights(
     results: Sequence[Result], title: str, path: Path, panels: Sequence[tuple[str, int | None, str]] = PANELS
 ) -> None:
     """Plot the flights of all followers in one scenario over time, one panel of `PANELS` below the other.
@@ -67,7 +67,7 @@ def draw_flights(
     axes = grid[:, 0]
     looks = follower_styles(result.follower for result in results)
     for axis, panel in zip(axes, panels, strict=True):
-        _draw_panel(axis, results, looks, *panel)
+        _plot_panel(axis, results, looks, *panel)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     legend_above(figure, axes, 4 if wide > 5 else 3, title)
@@ -90,7 +90,7 @@ def _values(flight: Trajectory, kind: str, index: int | None) -> np.ndarray:
     return values if index == 2 else np.degrees(values)
 
 
-def _draw_panel(
+def _plot_panel(
     axis: Any, results: Sequence[Result], looks: dict[str, dict[str, Any]], kind: str, index: int | None, label: str
 ) -> None:
     time = results[0].flight.time
@@ -132,12 +132,12 @@ def _draw_panel(
 def write_results(results: Sequence[Result], out: Path, look: str = "screen") -> None:
     """Write `cells.json` and, for each scenario, a PNG (PDF in the style `paper`) into `out`, which is created."""
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / RESULTS, to_json(results))
+    write_atomically(out / RESULTS, to_json(results))
     with style(look):
         ending = "png" if file_format() == "svg" else file_format()
         for _, group in itertools.groupby(results, key=lambda result: result.scenario):
             same = list(group)
-            draw_flights(same, scenario_title(same[0]), out / f"{scenario_stem(same[0])}.{ending}")
+            plot_flights(same, scenario_title(same[0]), out / f"{scenario_stem(same[0])}.{ending}")
 
 
 @dataclass(frozen=True)

@@ -11,25 +11,25 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
-from mjxball.policy.file import law_of
+from mjxball.policy.file import controller_of
 from mjxball.sim.outside import outside
 from mjxball.terminal import warn
 
 
-def load_policy(path: Path, config: Config, compare_laws: bool = True, seconds: float = 0.0) -> Policy:
+def load_policy(path: Path, config: Config, compare_controllers: bool = True, seconds: float = 0.0) -> Policy:
     """Load a policy and refuse one that was made for another plant or rate, or for other control laws.
 
     Warns on stderr where a flight of `seconds` [s] goes beyond what its card says it was flown for.
     """
-    policy = _fitting(path, config, compare_laws)
-    for text in beyond_card(policy.card, config.plant.count, seconds):
+    policy = _fitting(path, config, compare_controllers)
+    for text in beyond_training(policy.metadata, config.plant.count, seconds):
         warn(f"warning: {path} {text}")
     return policy
 
 
-def beyond_card(card: dict[str, Any], drones: int, seconds: float) -> list[str]:
+def beyond_training(metadata: dict[str, Any], drones: int, seconds: float) -> list[str]:
     """How a flight of `seconds` [s] with so many `drones` goes beyond what `card` says of flights, one phrase each."""
-    flown = card.get("flown")
+    flown = metadata.get("flown")
     if flown is None:
         return []
     sizes, longest = sorted(flown["drones"]), flown["seconds"]
@@ -41,13 +41,13 @@ def beyond_card(card: dict[str, Any], drones: int, seconds: float) -> list[str]:
     return found
 
 
-def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
+def _fitting(path: Path, config: Config, compare_controllers: bool) -> Policy:
     policy = Policy.load(path)
     policy.join(config.plant)
     period = config.timing.control_period
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
-    made_for = _of_card(path, {"plant": policy.card["plant"]}).plant
+    made_for = _from_metadata(path, {"plant": policy.metadata["plant"]}).plant
     if flies_any_rig(policy):
         if config.plant.stand != "free":
             raise InputError(f"{path} was made for free flight, not for a stand")
@@ -67,12 +67,12 @@ def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
     for (key, found, _), (_, value, _) in pairs:
         if key != "object_mass" and found != value:
             raise InputError(f"{path} was made for another plant: {key} is {found!r}, not {value!r}")
-    if compare_laws:
-        _refuse_other_laws(path, policy.card, config)
+    if compare_controllers:
+        _refuse_other_controllers(path, policy.metadata, config)
     return policy
 
 
-def _of_card(name: Path | str, record: dict[str, Any]) -> Config:
+def _from_metadata(name: Path | str, record: dict[str, Any]) -> Config:
     """The configuration that the card of the policy `name` holds; InputError, which names the policy, if it is none."""
     try:
         return configs.from_record(record)
@@ -82,18 +82,18 @@ def _of_card(name: Path | str, record: dict[str, Any]) -> Config:
 
 def flies_any_rig(policy: Policy) -> bool:
     """Whether `policy` flies any rig, of which it is told where the drones are mounted alone."""
-    return law_of(policy.card).geometry and trained_rigs(policy).rigs.number > 0
+    return controller_of(policy.metadata).geometry and trained_rigs(policy).rigs.number > 0
 
 
 def trained_rigs(policy: Policy) -> Config:
     """The configuration that a policy for any rig was trained with; the preset's where its card has none."""
-    settings = policy.card.get("config")
-    return _of_card(policy.name, settings) if isinstance(settings, dict) else configs.preset("universal")
+    settings = policy.metadata.get("config")
+    return _from_metadata(policy.name, settings) if isinstance(settings, dict) else configs.preset("universal")
 
 
 def team_sizes(policy: Policy) -> tuple[int, ...]:
     """Numbers of drones of the teams that `policy` was trained in; () if it was made for one plant."""
-    return _of_card(policy.name, {"plant": {}, **policy.card.get("config", {})}).scenario.team_sizes
+    return _from_metadata(policy.name, {"plant": {}, **policy.metadata.get("config", {})}).scenario.team_sizes
 
 
 def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> None:
@@ -105,11 +105,11 @@ def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> N
         raise InputError(f"{path} was made for ideal drones that carry a load which moves in the plane")
 
 
-def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None:
+def _refuse_other_controllers(path: Path, metadata: dict[str, Any], config: Config) -> None:
     """Refuse a policy whose leader or attitude loop was another than the one that it would fly with."""
-    if "config" not in card:
+    if "config" not in metadata:
         return
-    trained = _of_card(path, {"plant": {}, **card["config"]})
+    trained = _from_metadata(path, {"plant": {}, **metadata["config"]})
     for section in ("leader", "attitude"):
         for key, made_for in dataclasses.asdict(getattr(trained, section)).items():
             if made_for != (value := getattr(getattr(config, section), key)):
@@ -119,7 +119,7 @@ def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None
 def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
     """What of the card's bounds a policy misses on the reference scenario, one phrase each."""
     misses = ["the flight failed"] if metrics.failed else []
-    for name, bound in sorted(policy.card["bounds"].items()):
+    for name, bound in sorted(policy.metadata["bounds"].items()):
         value = getattr(metrics, name, None)
         if value is None or value > bound:
             misses.append(f"{name} {'never' if value is None else f'{value:.4g}'} > {bound:g}")
@@ -128,10 +128,10 @@ def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
 
 def native_config(path: Path) -> Config | None:
     """The configuration in a policy's card if its plant is not the paper's: Crazyflies, a team, a rig; else None."""
-    settings = Policy.load(path).card.get("config")
+    settings = Policy.load(path).metadata.get("config")
     if not isinstance(settings, dict):
         return None
-    found = configs.validate(_of_card(path, settings))
+    found = configs.validate(_from_metadata(path, settings))
     paper = found.autopilot.kind == "ideal" and found.plant == configs.preset("paper").plant
     return None if paper else found
 

@@ -54,7 +54,7 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
     return tuple(check_scenario(settings, scenario) for scenario in (reference, *others))
 
 
-def rig_line(settings: Config, mass: float | None = None) -> str:
+def rig_summary(settings: Config, mass: float | None = None) -> str:
     """Summary of a rig for the user, with an object of `mass` [kg]; None: the reference's mass."""
     plant, margin = settings.plant, settings.scenario.trim_margin
     reference = of_plant(settings, Scenario())

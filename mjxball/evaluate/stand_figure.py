@@ -102,7 +102,7 @@ def _stand_flight(config: Config, flown: Trajectory) -> StandFlight:
     return StandFlight(flown.time, LEVEL + rise, flown.euler[:, 0], flown.follower_command[:, 2], ball)
 
 
-def draw_stand(policies: Sequence[Policy], physics: str) -> Figure:
+def plot_stand(policies: Sequence[Policy], physics: str) -> Figure:
     """Classical followers and the policies for the stand, with both settings of the leader."""
     flown: dict[str, dict[str, StandFlight]] = {}
     for settings in SETTINGS:

@@ -14,10 +14,12 @@ from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import State, TransportEnv
 from mjxball.gym import core
-from mjxball.quiet import quietly
+from mjxball.quiet import import_quietly
 
 try:
-    base = quietly("jaxmarl.environments.multi_agent_env")  # its MABrax replaces sys.stdout; `quietly` puts it back
+    base = import_quietly(
+        "jaxmarl.environments.multi_agent_env"
+    )  # its MABrax replaces sys.stdout; `import_quietly` puts it back
 except ModuleNotFoundError as error:
     if error.name != "jaxmarl":
         raise

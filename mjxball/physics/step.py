@@ -72,7 +72,7 @@ def make_control_step(
 
     def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         loops, target = autopilot(state, commands, load)
-        keep, mean = rotor_shares(params.rotor_lag, load.rotor_lag_scale, h)
+        keep, mean = lag_weights(params.rotor_lag, load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
         if load.thrust_fade is not None:
@@ -98,7 +98,7 @@ def make_control_step(
     return control_step
 
 
-def rotor_shares(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
+def lag_weights(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
     """Weights of the old rotor force after a step of `h` [s] and in its mean over the step; `lag` and `h` in [s]."""
     if scale is None and isinstance(lag, float):
         keep = math.exp(-h / lag)

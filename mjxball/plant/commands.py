@@ -38,7 +38,7 @@ def commanded(plant: Plant | Config) -> tuple[Plant, CommandLimits | None]:
     return config.plant, CommandLimits((roll, pitch), config.command.tilt_limit, config.command.vertical_limit)
 
 
-def asked_rows(
+def command_rows(
     plant: Plant, commands: CommandLimits | None, drones: np.ndarray, factor: np.ndarray, believes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (yaw torques (A, 4 N), commands (3 A, 4 N), commands at hover (3 A,)) of the A drones numbered `drones`.
@@ -53,7 +53,7 @@ def asked_rows(
     yaw_rows, rows, at_hover = [], [], []
     for number in drones:
         x, y, _ = plant.drones[number].mount
-        thrust, roll, pitch, yaw = effect_of(plant, number)
+        thrust, roll, pitch, yaw = wrench_per_force(plant, number)
         roll, pitch = roll - y * thrust, pitch + x * thrust  # about the drone's own centre
         for axis, torque in enumerate((roll, pitch)):
             rows.append(_placed(torque / (commands.gains[axis] * commands.tilt * factor[number]), number, plant.count))
@@ -70,7 +70,7 @@ def _placed(row: np.ndarray, number: int, count: int) -> np.ndarray:
     return found.ravel()
 
 
-def effect_of(plant: Plant, number: int) -> Float[np.ndarray, "4 4"]:
+def wrench_per_force(plant: Plant, number: int) -> Float[np.ndarray, "4 4"]:
     """Wrench about O (T, tau_x, tau_y, tau_z) per unit force of each rotor of one drone, a column per rotor [1, m]."""
     drone, arm = plant.drones[number], plant.of_drones("arm")[number]
     cosine, sine = math.cos(drone.yaw), math.sin(drone.yaw)

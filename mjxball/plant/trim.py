@@ -27,7 +27,7 @@ import numpy as np
 from mjxball.arrays import Array
 from mjxball.config import Config, Plant, thrust_over_weight, total_mass
 from mjxball.errors import InputError
-from mjxball.plant.commands import CommandLimits, asked_rows, commanded, effect_of
+from mjxball.plant.commands import CommandLimits, command_rows, commanded, wrench_per_force
 from mjxball.plant.parameters import PlantParameters
 
 TINY, LEAST_SCATTER = 1e-9, 1e-3  # [N], [m2] below which drones sit in one place
@@ -270,7 +270,7 @@ def _hover(
         return None
     level = lift / 4 * capacity / capacity.sum()
 
-    drones = [effect_of(plant, number) for number in range(count)]
+    drones = [wrench_per_force(plant, number) for number in range(count)]
     # Weights pull at their places: the wrench that holds them is (1, y, -x, 0) times each.
     held = gravity * masses @ np.column_stack([np.ones(count), mounts[:, 1], -mounts[:, 0], np.zeros(count)])
     held[0] = weight
@@ -278,7 +278,7 @@ def _hover(
     unit = lift / (4 * acts.sum())
     believes = np.array(plant.known_masses) + np.array(plant.load_shares) * believed
     answer = np.flatnonzero(acts & (limit > 0))
-    twist, commands_asked, level_command = asked_rows(plant, commands, answer, factor, believes)
+    twist, commands_asked, level_command = command_rows(plant, commands, answer, factor, believes)
     columns = np.repeat(acts, 4)
     return _Hover(
         effect=np.vstack([np.column_stack(drones), twist])[:, columns],

@@ -12,39 +12,39 @@ import numpy as np
 
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
-from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.follower_controller import FollowerController
 from mjxball.control.geometry import GEOMETRY
 from mjxball.control.motors import firmware
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.policy.file import PolicyFile
 
 
 def policy_file(
-    config: Config, law: FollowerLaw, learnt: Any, steps: int, origin: dict[str, Any] | None = None
+    config: Config, controller: FollowerController, learnt: Any, steps: int, origin: dict[str, Any] | None = None
 ) -> PolicyFile:
     """The policy file of a trained network, `learnt` (`algorithms.base.PolicyNetwork`), after `steps` steps.
 
-    `law`: `sim.follower.follower_law(config)`. `origin` (command, seed, commit, ...) is added to the metadata.
+    `law`: `sim.follower.follower_controller(config)`. `origin` (command, seed, commit, ...) is added to the metadata.
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
     size = (
-        law.input_size
+        controller.input_size
     )  # further inputs are a GRU's state, and those of critics alone, whose weights are not exported
-    mask = np.array(law.mask(follower.ignore_position))[:size]
+    mask = np.array(controller.mask(follower.ignore_position))[:size]
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
-    card = {
-        "format_version": 5 if law.units else 1,
+    metadata = {
+        "format_version": 5 if controller.units else 1,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": 1,  # number of observations; 0.1.0 and earlier allowed more
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
-        **({"recurrent_units": law.units} if law.units else {}),
+        **({"recurrent_units": controller.units} if controller.units else {}),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
-        **({"context": list(GEOMETRY)} if law.geometry else {}),
+        **({"context": list(GEOMETRY)} if controller.geometry else {}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),
@@ -65,12 +65,12 @@ def policy_file(
     keep = np.append(commanded(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(np.float32)
     weights[-1], biases[-1] = weights[-1] * keep, biases[-1] * keep
     return PolicyFile(
-        weights=(weights[0][: size + law.units], *weights[1:]),
+        weights=(weights[0][: size + controller.units], *weights[1:]),
         biases=tuple(biases),
         observation_mean=np.asarray(learnt.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([action_scale[0], action_scale[0], action_scale[1]], np.float32),
-        card=card,
+        metadata=metadata,
         gru=_gru(learnt),
     )
 
@@ -105,9 +105,9 @@ def network_file(path: Path, learnt: Any, steps: int, origin: dict[str, Any]) ->
     if not all(np.isfinite(array).all() for array in arrays.values()):
         return False
     stream = io.BytesIO()
-    card: dict[str, Any] = {"training_steps": steps, "package_version": __version__, **origin}
-    np.savez(stream, card=np.array(json.dumps(card, sort_keys=True)), **arrays)
-    write_whole(path, stream.getvalue())
+    metadata: dict[str, Any] = {"training_steps": steps, "package_version": __version__, **origin}
+    np.savez(stream, **arrays | {"card": np.array(json.dumps(metadata, sort_keys=True))})
+    write_atomically(path, stream.getvalue())
     return True
 
 

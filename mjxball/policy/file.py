@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.follower_controller import FollowerController
 from mjxball.control.geometry import GEOMETRY
 from mjxball.control.network import Network
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, ObservationHistory
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.reading import is_number, parse_json
 
@@ -36,10 +36,10 @@ MAX_NUMBER = 1e6  # size of any number in the metadata and of any weight; larger
 FOLDER = "policies"  # shipped policies
 ARCHIVE = "archive"  # in FOLDER: earlier policies that documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # sections of the configuration that evaluation reads
-MAX_CARD = 2**20  # characters
+MAX_METADATA = 2**20  # characters
 # Metrics with bounds in the metadata; of each smaller values are better.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
-CARD_FIELDS: dict[str, type] = {
+METADATA_FIELDS: dict[str, type] = {
     **dict.fromkeys(("format_version", "history", "training_steps"), int),
     **dict.fromkeys(("gravity", "control_period"), float),
     "previous_action": bool,
@@ -59,23 +59,23 @@ class PolicyFile:
     observation_mean: np.ndarray  # (n,) float32
     observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for an input that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
-    card: dict[str, Any]
+    metadata: dict[str, Any]
     gru: tuple[np.ndarray, ...] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
 
 
-def law_of(card: dict[str, Any]) -> FollowerLaw:
+def controller_of(metadata: dict[str, Any]) -> FollowerController:
     """The controller around the network of a policy file with metadata `card`; the first files have no `filters`."""
-    filters = tuple(card.get("filters", ()))
-    return FollowerLaw(
-        history=ObservationHistory(card["previous_action"], filters, float(card["control_period"])),
-        action_scale=tuple(card["action_reach"]),
-        limits=tuple(card["command_limits"]),
-        kp=tuple(card["leader_kp"]),
-        kd=tuple(card["leader_kd"]),
-        gravity=card["gravity"],
-        residual=card["action_mode"] == "residual",
-        units=card.get("recurrent_units", 0),
-        geometry=card["format_version"] == 5 and "context" in card,
+    filters = tuple(metadata.get("filters", ()))
+    return FollowerController(
+        history=ObservationHistory(metadata["previous_action"], filters, float(metadata["control_period"])),
+        action_scale=tuple(metadata["action_reach"]),
+        limits=tuple(metadata["command_limits"]),
+        kp=tuple(metadata["leader_kp"]),
+        kd=tuple(metadata["leader_kd"]),
+        gravity=metadata["gravity"],
+        residual=metadata["action_mode"] == "residual",
+        units=metadata.get("recurrent_units", 0),
+        geometry=metadata["format_version"] == 5 and "context" in metadata,
     )
 
 
@@ -86,7 +86,7 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
         "observation_mean": policy.observation_mean,
         "observation_scale": policy.observation_scale,
         "action_scale": policy.action_scale,
-        "card": np.array(json.dumps(policy.card, sort_keys=True)),
+        "card": np.array(json.dumps(policy.metadata, sort_keys=True)),
     }
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         arrays[f"weight_{number}"], arrays[f"bias_{number}"] = weight, bias
@@ -94,7 +94,7 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
         arrays |= dict(zip(GRU_ARRAYS, policy.gru, strict=True))
     stream = io.BytesIO()
     np.savez(stream, **arrays)
-    write_whole(path, stream.getvalue())
+    write_atomically(path, stream.getvalue())
 
 
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:
@@ -112,14 +112,14 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
                 "; mjxball.policy.load_network reads that of another environment" if needed == "action_scale" else ""
             )
             raise PolicyFileError(f"{name} is not a policy file: it has no {needed}{foreign}")
-    card = _read_card(name, arrays.pop("card"))
-    _check_version(card, name)  # before the arrays, which may differ in later formats
+    metadata = _read_metadata(name, arrays.pop("card"))
+    _check_version(metadata, name)  # before the arrays, which may differ in later formats
     layers = 0
     while f"weight_{layers}" in arrays:
         layers += 1
     expected = {"observation_mean", "observation_scale", "action_scale"}
     expected |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(layers)}
-    recurrent = card["format_version"] == 5
+    recurrent = metadata["format_version"] == 5
     expected |= set(GRU_ARRAYS) if recurrent else set()
     odd = sorted(set(arrays) ^ expected)
     if odd or not layers:
@@ -130,7 +130,7 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
         observation_mean=arrays["observation_mean"],
         observation_scale=arrays["observation_scale"],
         action_scale=arrays["action_scale"],
-        card=card,
+        metadata=metadata,
         gru=tuple(arrays[label] for label in GRU_ARRAYS) if recurrent else None,
     )
     check(policy, name)
@@ -157,25 +157,25 @@ def load_network(path: str | os.PathLike[str]) -> Network:
     return found
 
 
-def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
+def _read_metadata(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.ndim != 0 or text.dtype.kind != "U":
         raise PolicyFileError(f"{name}: the card is not one string")
-    if text.dtype.itemsize > 4 * MAX_CARD:  # parsed JSON takes fifty times as much memory
-        raise PolicyFileError(f"{name}: the card is longer than {MAX_CARD} characters")
+    if text.dtype.itemsize > 4 * MAX_METADATA:  # parsed JSON takes fifty times as much memory
+        raise PolicyFileError(f"{name}: the card is longer than {MAX_METADATA} characters")
     try:
-        card = parse_json(str(text))
+        metadata = parse_json(str(text))
     except (ValueError, RecursionError) as error:
         raise PolicyFileError(f"{name}: the card is not JSON: {error}") from None
-    if not isinstance(card, dict):
+    if not isinstance(metadata, dict):
         raise PolicyFileError(f"{name}: the card is not a JSON object")
-    return card
+    return metadata
 
 
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is valid."""
-    _check_card(policy.card, name)
-    law = law_of(policy.card)
-    size = law.input_size
+    _check_metadata(policy.metadata, name)
+    controller = controller_of(policy.metadata)
+    size = controller.input_size
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -185,13 +185,13 @@ def check(policy: PolicyFile, name: str) -> None:
         _check_array(name, label, array, (length,))
     if (policy.observation_scale < 0).any() or (policy.action_scale <= 0).any():
         raise PolicyFileError(f"{name}: observation_scale must not be negative and action_scale must be positive")
-    if not np.allclose(policy.action_scale, _action_scale(policy.card), rtol=1e-6, atol=0):
+    if not np.allclose(policy.action_scale, _action_scale(policy.metadata), rtol=1e-6, atol=0):
         raise PolicyFileError(f"{name}: action_scale differs from the card's action_reach")
-    _check_gru(policy, name, size, law.units)
-    width = size + law.units
+    _check_gru(policy, name, size, controller.units)
+    width = size + controller.units
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         last = number == len(policy.weights) - 1
-        width += law.units if last else 0
+        width += controller.units if last else 0
         out = 2 * ACTION_SIZE if last else (weight.shape[1] if weight.ndim == 2 else -1)
         _check_array(name, f"weight_{number}", weight, (width, out))
         _check_array(name, f"bias_{number}", bias, (out,))
@@ -207,8 +207,8 @@ def _check_gru(policy: PolicyFile, name: str, inputs: int, units: int) -> None:
             _check_array(name, label, array, shape)
 
 
-def _action_scale(card: dict[str, Any]) -> list[float]:
-    tilt, vertical = card["action_reach"]
+def _action_scale(metadata: dict[str, Any]) -> list[float]:
+    tilt, vertical = metadata["action_reach"]
     return [tilt, tilt, vertical]
 
 
@@ -223,8 +223,8 @@ def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...
         raise PolicyFileError(f"{name}: {label} is empty or holds a value beyond {MAX_NUMBER:g}")
 
 
-def _check_version(card: dict[str, Any], name: str) -> None:
-    version = card.get("format_version")
+def _check_version(metadata: dict[str, Any], name: str) -> None:
+    version = metadata.get("format_version")
     if type(version) is int and version in ENDED:
         raise PolicyFileError(
             f"{name} has policy format {version}, a network on top of {ENDED[version]}: mjxball {LAST_VERSION} is the "
@@ -235,64 +235,64 @@ def _check_version(card: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name} has policy format {version!r}; this version reads formats {known}")
 
 
-def _check_card(card: dict[str, Any], name: str) -> None:
-    _check_version(card, name)
-    for fault in _card_faults(card):
+def _check_metadata(metadata: dict[str, Any], name: str) -> None:
+    _check_version(metadata, name)
+    for fault in _card_faults(metadata):
         raise PolicyFileError(f"{name}: {fault}")
 
 
-def _card_faults(card: dict[str, Any]) -> Iterator[str]:
+def _card_faults(metadata: dict[str, Any]) -> Iterator[str]:
     """Phrases on what is wrong with the metadata of a policy; after the first one others need not be right."""
-    for field, kind in CARD_FIELDS.items():
-        value = card.get(field)
+    for field, kind in METADATA_FIELDS.items():
+        value = metadata.get(field)
         kinds = (int, float) if kind is float else kind
         if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
             yield f"card field {field} is missing or not {kind.__name__}"
-    if card["observation"] != [list(slot) for slot in OBSERVATION]:
+    if metadata["observation"] != [list(slot) for slot in OBSERVATION]:
         yield "the policy was made for another observation than this version's 18 numbers"
-    if card["action"] != [list(slot) for slot in ACTION]:
+    if metadata["action"] != [list(slot) for slot in ACTION]:
         yield "the policy was made for another action than roll, pitch, vertical acceleration"
-    config = card.get("config", {})
+    config = metadata.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
         yield "card field config is not a configuration"
-    yield from _number_faults(card)
-    if card["format_version"] == 5 and "context" in card:
-        yield from _geometry_faults(card)
-    if card.get("flown") is not None:
-        yield from _flown_faults(card["flown"])
+    yield from _number_faults(metadata)
+    if metadata["format_version"] == 5 and "context" in metadata:
+        yield from _geometry_faults(metadata)
+    if metadata.get("flown") is not None:
+        yield from _flown_faults(metadata["flown"])
 
 
-def _number_faults(card: dict[str, Any]) -> Iterator[str]:
+def _number_faults(metadata: dict[str, Any]) -> Iterator[str]:
     """Of fields that have the right types."""
-    if card["action_mode"] not in ("residual", "direct"):
-        yield f"action_mode must be residual or direct, not {card['action_mode']!r}"
-    if card["history"] != 1:
-        yield f"history must be 1, not {card['history']}; more of it mjxball {LAST_VERSION} flies"
-    filters = card.get("filters", [])
+    if metadata["action_mode"] not in ("residual", "direct"):
+        yield f"action_mode must be residual or direct, not {metadata['action_mode']!r}"
+    if metadata["history"] != 1:
+        yield f"history must be 1, not {metadata['history']}; more of it mjxball {LAST_VERSION} flies"
+    filters = metadata.get("filters", [])
     if not isinstance(filters, list) or len(filters) > 10 or not all(is_finite(t) and t >= 1e-3 for t in filters):
         yield "filters must be up to 10 time constants of at least 1 ms"
     for field, length in LENGTHS.items():
-        if len(card[field]) != length or not all(is_finite(value) and value >= 0 for value in card[field]):
+        if len(metadata[field]) != length or not all(is_finite(value) and value >= 0 for value in metadata[field]):
             yield f"card field {field} must be {length} finite numbers"
-    units, most = card.get("recurrent_units", 0), MAX_UNITS if card["format_version"] == 5 else 0
+    units, most = metadata.get("recurrent_units", 0), MAX_UNITS if metadata["format_version"] == 5 else 0
     if type(units) is not int or not min(most, 1) <= units <= most:
         yield f"card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
     for field in ("control_period", "gravity"):
-        if not (is_finite(card[field]) and card[field] >= 1e-6):
+        if not (is_finite(metadata[field]) and metadata[field] >= 1e-6):
             yield f"card field {field} must be positive"
-    if not all(map(is_finite, card["bounds"].values())):
+    if not all(map(is_finite, metadata["bounds"].values())):
         yield "card field bounds must hold finite numbers"
-    for odd in sorted(set(card["bounds"]) - set(BOUNDED)):
+    for odd in sorted(set(metadata["bounds"]) - set(BOUNDED)):
         yield f"card field bounds names {odd!r}; known are {', '.join(BOUNDED)}"
 
 
-def _geometry_faults(card: dict[str, Any]) -> Iterator[str]:
+def _geometry_faults(metadata: dict[str, Any]) -> Iterator[str]:
     """Of `context`, and of `team`: the geometry of a team as one of its drones sees it."""
-    if card["context"] != list(GEOMETRY):
+    if metadata["context"] != list(GEOMETRY):
         yield f"the policy needs another context than this version's {', '.join(GEOMETRY)}"
-    if "team" not in card:
+    if "team" not in metadata:
         return
-    team = card["team"]
+    team = metadata["team"]
     if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
         yield "card field team must hold drone, mount_angle and context"
     if not (is_finite(team["drone"]) and is_finite(team["mount_angle"])):

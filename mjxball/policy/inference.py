@@ -12,17 +12,17 @@ import numpy as np
 from mjxball.arrays import Array, real_numbers
 from mjxball.config import Plant
 from mjxball.control import observation as layout
-from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.follower_controller import FollowerController
 from mjxball.control.followers import OneThread, check_batch, checked_observation
 from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, law_of, load_file
+from mjxball.policy.file import PolicyFile, controller_of, load_file
 
 ROUNDED = 1e-5  # tolerance for a GRU's state beyond 1, from rounding
 
 
-def not_told(name: str) -> InputError:
+def missing_team_error(name: str) -> InputError:
     """The error for a policy that needs the geometry of its team and has none."""
     return InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
 
@@ -32,13 +32,13 @@ def geometry_of(plant: Plant) -> np.ndarray:
     return np.asarray(team_geometry(plant, np.array([drone.mount for drone in plant.drones]), np.float64(plant.count)))
 
 
-def known_geometry(card: dict[str, Any], name: str) -> np.ndarray | None:
+def known_geometry(metadata: dict[str, Any], name: str) -> np.ndarray | None:
     """Geometry of the team in a policy's metadata, (4,); None for a policy that takes no geometry.
 
     Raises InputError if it needs geometry that the metadata do not contain.
     """
-    team = card.get("team")
-    return _geometry_for(name, law_of(card), None if team is None else np.array(team["context"]))
+    team = metadata.get("team")
+    return _geometry_for(name, controller_of(metadata), None if team is None else np.array(team["context"]))
 
 
 class Policy:
@@ -50,10 +50,10 @@ class Policy:
 
     def __init__(self, contents: PolicyFile, name: str, dtype: type = np.float32):
         """Prepare `contents` for inference in `dtype` (float32 on the laptop, float64 for tests)."""
-        card = contents.card
+        metadata = contents.metadata
         self.name = name
-        self.card = card
-        self.control_period = float(card["control_period"])
+        self.metadata = metadata
+        self.control_period = float(metadata["control_period"])
         self._dtype = np.dtype(dtype)
         half = layout.ACTION_SIZE
         weights = [*contents.weights[:-1], contents.weights[-1][:, :half]]
@@ -64,9 +64,9 @@ class Policy:
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
         gru: Any = None if contents.gru is None else tuple(np.ascontiguousarray(part, dtype) for part in contents.gru)
         self._network = Network(self._weights, self._biases, self._mean, self._scale, gru)
-        self._law = law_of(card)
-        known = self._law.geometry and "team" in card
-        self._geometry: Array | None = np.array(card["team"]["context"], dtype) if known else None
+        self._controller = controller_of(metadata)
+        known = self._controller.geometry and "team" in metadata
+        self._geometry: Array | None = np.array(metadata["team"]["context"], dtype) if known else None
         self._memory: Array | None = None
         self._thread = OneThread()
 
@@ -74,8 +74,17 @@ class Policy:
     def _facts(self) -> dict[str, object]:
         """Properties that a representation shows, by label; None if absent."""
         layers = [len(bias) for bias in self._biases[:-1]]
-        run = {"preset": self.card.get("preset"), "seed": self.card.get("seed"), "steps": self.card["training_steps"]}
-        return {**run, "GRU": self._law.units or None, "layers": layers, "period": f"{1e3 * self.control_period:g} ms"}
+        run = {
+            "preset": self.metadata.get("preset"),
+            "seed": self.metadata.get("seed"),
+            "steps": self.metadata["training_steps"],
+        }
+        return {
+            **run,
+            "GRU": self._controller.units or None,
+            "layers": layers,
+            "period": f"{1e3 * self.control_period:g} ms",
+        }
 
     def __repr__(self) -> str:
         facts = ", ".join(f"{name} {value}" for name, value in self._facts.items() if value is not None)
@@ -85,13 +94,13 @@ class Policy:
         """HTML for notebooks: the run that trained it, and its learning curve."""
         from mjxball import pictures
 
-        curve, lines = self.card.get("curve") or {}, []
+        curve, lines = self.metadata.get("curve") or {}, []
         if curve.get("steps"):
             lines = [pictures.Curve("exploring", curve["steps"], curve["episode_return"])]
             lines += [pictures.Curve("evaluated", curve["eval_steps"], curve["eval_return"], dots=True)]
         plot = pictures.curves(lines, "environment steps", "return of an episode") if lines else ""
         facts = {name: value for name, value in self._facts.items() if value is not None}
-        return pictures.card(f"policy {self.name}", facts, plot)
+        return pictures.metadata(f"policy {self.name}", facts, plot)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
@@ -100,7 +109,7 @@ class Policy:
 
     def join(self, plant: Plant) -> None:
         """Set the geometry of the team on `plant`, if the policy takes it. Must precede the first call."""
-        if self._law.geometry:
+        if self._controller.geometry:
             self._geometry = geometry_of(plant).astype(self._dtype)
 
     def reset(self) -> None:
@@ -108,13 +117,13 @@ class Policy:
         self.memory = None
 
     @property
-    def law(self) -> NetworkLaw:
+    def controller(self) -> NetworkController:
         """The same controller as pure functions."""
-        return NetworkLaw(self)
+        return NetworkController(self)
 
     @property
     def memory(self) -> Array:
-        """Memory (..., m), see `control.follower_law.FollowerLaw`; None before the first call."""
+        """Memory (..., m), see `control.follower_controller.FollowerController`; None before the first call."""
         return self._memory
 
     @memory.setter
@@ -126,8 +135,8 @@ class Policy:
     @property
     def hidden(self) -> Array | None:
         """State of the GRU (..., H) in [-1, 1], a part of `memory`; None without a GRU or before the first call."""
-        memory = self.memory if self._law.units else None
-        return None if memory is None else self._law.hidden(memory)
+        memory = self.memory if self._controller.units else None
+        return None if memory is None else self._controller.hidden(memory)
 
     def __getstate__(self) -> dict[str, Any]:
         """State of a copy, which may be used in another thread."""
@@ -148,14 +157,16 @@ class Policy:
     def _answer(self, observation: Array) -> tuple[Array, Array]:
         """(action in [-1, 1], command) for `observation`; updates the memory."""
         observation = checked_observation(observation).astype(self._dtype, copy=False)
-        remembers = self._law.size > 0
+        remembers = self._controller.size > 0
         if remembers:
             self._thread.check(self.name)
-        law, memory = self.law, self.memory if remembers else None
+        controller, memory = self.controller, self.memory if remembers else None
         if memory is not None:
             check_batch(self.name, memory.shape[:-1], observation)
         with np.errstate(all="ignore"):  # results that are not finite are refused below
-            action, command, memory = law.answer(law.start(observation) if memory is None else memory, observation)
+            action, command, memory = controller.answer(
+                controller.start(observation) if memory is None else memory, observation
+            )
         if not math.isfinite(float(command.sum()) + float(memory.sum())):
             raise InputError(f"policy {self.name} has no answer to an observation: what it computes is not finite")
         if remembers:
@@ -164,20 +175,20 @@ class Policy:
 
     def _checked(self, memory: Array) -> Array:
         """A copy of `memory`. Raises InputError unless it can be a memory of this policy."""
-        given, size = real_numbers(memory, f"a memory of policy {self.name}"), self._law.size
+        given, size = real_numbers(memory, f"a memory of policy {self.name}"), self._controller.size
         if given.shape[-1:] != (size,):
             raise InputError(f"policy {self.name} remembers {size} numbers, not an array of shape {given.shape}")
         with np.errstate(over="ignore"):
             copied = np.array(given, self._dtype)
         if not np.isfinite(copied).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
-        if (np.abs(self._law.hidden(copied)) > 1 + ROUNDED).any():
+        if (np.abs(self._controller.hidden(copied)) > 1 + ROUNDED).any():
             raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
         return copied
 
 
-class NetworkLaw:
-    """A policy as pure functions of NumPy or JAX arrays (see `control.followers.Law`), for any number of threads.
+class NetworkController:
+    """A policy as pure functions of NumPy or JAX arrays (`control.followers.Controller`), for any number of threads.
 
     Arguments are not checked, so that JAX can trace the functions.
     """
@@ -187,7 +198,7 @@ class NetworkLaw:
     def __init__(self, policy: Policy):
         self.name = policy.name
         self._network = policy._network
-        self._law = policy._law
+        self._controller = policy._controller
         self._geometry = policy._geometry
 
     def start(self, observation: Array) -> Array:
@@ -195,15 +206,15 @@ class NetworkLaw:
 
         Raises InputError if it needs a geometry that is not set, or is set for another number of followers.
         """
-        geometry = _geometry_for(self.name, self._law, self._geometry)
+        geometry = _geometry_for(self.name, self._controller, self._geometry)
         if geometry is not None and geometry.ndim > 1 and observation.shape[-2:-1] != geometry.shape[:1]:
             joined = f"policy {self.name} was told of {len(geometry)} followers (Policy.join)"
             raise InputError(f"{joined}, and an observation of shape {observation.shape} is not of so many")
-        return self._law.start(observation, geometry)
+        return self._controller.start(observation, geometry)
 
     def hidden(self, memory: Array) -> Array:
         """State (..., H) of the network's GRU in `memory` (..., m)."""
-        return self._law.hidden(memory)
+        return self._controller.hidden(memory)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
@@ -212,14 +223,17 @@ class NetworkLaw:
 
     def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
-        network_input = self._law.network_input(observation, memory) if self._law.size else observation
+        network_input = self._controller.network_input(observation, memory) if self._controller.size else observation
         output = self._network.like(observation)(network_input)
-        command, after = self._law.command(output, observation), self._law.next(memory, observation, output)
+        command, after = (
+            self._controller.command(output, observation),
+            self._controller.next(memory, observation, output),
+        )
         return output[..., : layout.ACTION_SIZE], command, after
 
 
-def _geometry_for(name: str, law: FollowerLaw, geometry: Array | None) -> Array | None:
+def _geometry_for(name: str, controller: FollowerController, geometry: Array | None) -> Array | None:
     """`geometry`. Raises InputError if it is None and `law` needs it."""
-    if law.geometry and geometry is None:
+    if controller.geometry and geometry is None:
         raise InputError(f"policy {name} has to be told its team before it flies (Policy.join)")
     return geometry

@@ -13,15 +13,15 @@ from mjxball.config import Config
 from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.inference import geometry_of, not_told
+from mjxball.policy.file import PolicyFile, controller_of
+from mjxball.policy.inference import geometry_of, missing_team_error
 
 CRAZYFLIES = Path("crazyflie")  # default plant of a policy for any rig
 
 
-def is_for_any(card: dict[str, Any]) -> bool:
+def is_for_any(metadata: dict[str, Any]) -> bool:
     """Whether `card` is the metadata of a policy for any rig that has not been adapted to one."""
-    return law_of(card).geometry and "team" not in card
+    return controller_of(metadata).geometry and "team" not in metadata
 
 
 def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | None = None) -> PolicyFile:
@@ -30,32 +30,32 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
     Its metadata then have `team`, and the plant and configuration of that team. Raises InputError if `config` or
     `drone` do not fit.
     """
-    if not law_of(policy.card).geometry:
+    if not controller_of(policy.metadata).geometry:
         if config is not None or drone is not None:
             raise InputError(f"{name} is told nothing of its team: leave --plant and --drone out")
         return policy
-    if config is None and drone is None and "team" in policy.card:
+    if config is None and drone is None and "team" in policy.metadata:
         return policy
     followers: tuple[int, ...] = (1,) if config is None else config.plant.followers
     if drone not in (followers if len(followers) > 1 else (None, *followers)):
         raise InputError(f"--drone must be a follower of --plant: {', '.join(map(str, followers))}")
     index = 0 if drone is None else followers.index(drone)
     if config is None:
-        raise not_told(name)
+        raise missing_team_error(name)
     team = {
         "drone": followers[index],
         "mount_angle": float(np.ravel(mount_frames(config.plant))[index]),
         "context": np.atleast_2d(geometry_of(config.plant))[index].tolist(),
     }
-    return replace(policy, card={**policy.card, **_card_of(config, policy.card), "team": team})
+    return replace(policy, metadata={**policy.metadata, **_metadata_of(config, policy.metadata), "team": team})
 
 
-def _card_of(config: Config, card: dict[str, Any]) -> dict[str, Any]:
+def _metadata_of(config: Config, metadata: dict[str, Any]) -> dict[str, Any]:
     """Metadata fields for plant and configuration of the policy with `card` on the plant of `config`.
 
     Preset, controllers and control period are those of training.
     """
-    trained = configs.from_record({"plant": {}, **card.get("config", {})})
+    trained = configs.from_record({"plant": {}, **metadata.get("config", {})})
     timing = replace(trained.timing, physics_steps=round(trained.timing.control_period / config.physics_step))
     kept = {name: getattr(trained, name) for name in ("preset", "leader", "command", "follower")}
     flown = configs.validate(replace(config, **kept, timing=timing))

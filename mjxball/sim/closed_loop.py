@@ -8,7 +8,7 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.physics.engine import has_diverged
-from mjxball.sim.laws import Body, Laws
+from mjxball.sim.controllers import Body, Controllers
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Load, PlantState, Scalar, Vector
     from mjxball.physics.step import ControlStep
     from mjxball.plant import PlantParameters
+    from mjxball.sim.controllers import Integral
     from mjxball.sim.disturbances import Observation, Sample, SensorModel, SensorState
-    from mjxball.sim.laws import Integral
 
     FollowerCommand = Float[Array, "... 3"]  # of several followers (..., F, 3)
 
@@ -39,8 +39,8 @@ class LoopState(NamedTuple):
     diverged: Bool[Array, "..."]  # where true, `plant` no longer changes
 
 
-class ClosedLoop(Laws):
-    """Controllers with sensors and physics: call `start`, then `step` repeatedly; shapes as in `sim.laws.Laws`."""
+class ClosedLoop(Controllers):
+    """Controllers with sensors and physics: call `start`, then `step` repeatedly; shapes as in `Controllers`."""
 
     def __init__(
         self, config: Config, physics: ControlStep, sensors: SensorModel, parameters: PlantParameters | None = None

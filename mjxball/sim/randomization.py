@@ -294,7 +294,7 @@ class ResetDistribution:
         apart = LIFT * (sum(drone.mass for drone in plant.drones) + mass) * self._lever if self._integrates else 0.0
         return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
 
-    def draw_battery_and_thrust(
+    def sample_battery_and_thrust(
         self, load: Load, key: Array, count: int = CANDIDATES
     ) -> tuple[Float[Array, " count"], Float[Array, " count"], Float[Array, "count 2"], Bool[Array, " count"]]:
         """Samples of battery [V], older firmware (0 or 1), thrust factors (count, 2), and whether each can be flown."""
@@ -347,7 +347,7 @@ class ResetDistribution:
         return 4 * asked / believed - gravity
 
     def initial_integrals(self, load: Load, key: Array) -> Float[Array, "7"]:
-        """Integrals (7,) (see `Laws`) of an environment that starts in the air: 0.6 to 1.1 of those that hover it."""
+        """Integrals (7,) (see `Controllers`) of an environment that starts in the air, 0.6 to 1.1 of hover."""
         leader = self.config.leader
         battery: Scalar = load.battery
         uncompensated: Scalar = load.uncompensated
@@ -366,7 +366,7 @@ class ResetDistribution:
 
     def _with_battery(self, load: Load, key: Array) -> Load:
         """`load` with the first sampled battery, firmware and thrusts that can fly, or nominal drones if none can."""
-        battery, uncompensated, scale, good = self.draw_battery_and_thrust(load, key)
+        battery, uncompensated, scale, good = self.sample_battery_and_thrust(load, key)
         first = jnp.argmax(good)
         found = good[first]
         return load._replace(

@@ -74,7 +74,7 @@ class RigTable(NamedTuple):
         return RigTable(_each(lambda part: part[chosen], self.numbers), *(part[chosen] for part in self[1:]))
 
 
-class Drawn(NamedTuple):
+class SampledRigs(NamedTuple):
     """Sampled rigs, and the numbers of samples and rejections."""
 
     rigs: RigTable
@@ -83,7 +83,7 @@ class Drawn(NamedTuple):
     untrimmed: int  # rejected: CG reach too short even with believed mass and thrusts close to the truth
 
 
-def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
+def sample_rigs(config: Config, size: int, count: int, seed: int) -> SampledRigs:
     """`count` rigs of `size` drones, padded to the drones of `config.plant`; the same `seed` gives the same rigs."""
     random = np.random.default_rng([seed, size])
     parts: list[RigTable] = []
@@ -99,12 +99,12 @@ def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
             untrimmed + (steady & ~held)[:last].sum(),
         )
         parts.append(table.rows(np.flatnonzero(good[:last])))
-    return Drawn(joined(parts), int(draws), int(damped), int(untrimmed))
+    return SampledRigs(joined(parts), int(draws), int(damped), int(untrimmed))
 
 
 def training_rigs(config: Config) -> RigTable:
     """`rigs.number` rigs of each of `scenario.team_sizes`, (sizes, number, ...), in float32."""
-    sampled = [draw_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
+    sampled = [sample_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
     table = joined(sampled)
     shape = (len(sampled), config.rigs.number)
 
@@ -117,7 +117,7 @@ def training_rigs(config: Config) -> RigTable:
 @functools.lru_cache(maxsize=16)
 def held_out(config: Config, size: int, count: int = HELD_OUT_RIGS) -> RigTable:
     """`count` rigs of `size` drones that no training uses, without padding; another `count` gives other rigs."""
-    return unpadded(draw_rigs(config, size, count, HELD_OUT).rigs, size)
+    return unpadded(sample_rigs(config, size, count, HELD_OUT).rigs, size)
 
 
 def joined(tables: list[RigTable]) -> RigTable:

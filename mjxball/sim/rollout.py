@@ -10,7 +10,7 @@ import numpy as np
 
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
-from mjxball.control.followers import Baseline, Follower, Law, PrivilegedInfo, checked_command
+from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
@@ -63,7 +63,7 @@ class Inputs(NamedTuple):
 
 def control_step(
     loop: ClosedLoop,
-    controller: Law,
+    controller: Controller,
     privileged: Callable[[PlantState, Load], Any],
     load: Load,
     carry: Carry,
@@ -186,7 +186,7 @@ class _Together:
         return ()
 
     def step(self, state: Any, observation: np.ndarray, privileged: PrivilegedInfo) -> tuple[Any, np.ndarray]:
-        """See `Law.step`."""
+        """See `Controller.step`."""
         commands = []
         for follower, part in self._followers:
             if isinstance(follower, Baseline):

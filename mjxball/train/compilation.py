@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.reading import parse_json
 from mjxball.xla import traced_directory
 
@@ -197,4 +197,4 @@ def _write(path: Path | None, exported: Any, unchanged: list[int]) -> None:
         return
     with contextlib.suppress(OSError):  # training works without the cache, which may be full or read-only
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, json.dumps(unchanged).encode() + b"\n" + exported.serialize())
+        write_atomically(path, json.dumps(unchanged).encode() + b"\n" + exported.serialize())

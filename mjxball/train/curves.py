@@ -87,7 +87,7 @@ def best_member(rows: list[dict[str, float]]) -> int:
     return int(np.argmax(returns)) if returns else 0
 
 
-def draw_members(run: Path, path: Path) -> None:
+def plot_members(run: Path, path: Path) -> None:
     """Figure of all members over training: steady-state error and return of each, with median and quartiles."""
     from mjxball.plotting import BLUE, INK, legend_above, logarithmic, pyplot, save
 
@@ -156,7 +156,7 @@ def _rows(run: Path) -> list[dict[str, str]]:
     return read_metrics(run / METRICS)
 
 
-def draw_training(run: Path, config: Config, path: Path) -> None:
+def plot_training(run: Path, config: Config, path: Path) -> None:
     """Plot `metrics.csv` of the directory `run` to `path`, whose directory is created."""
     from mjxball.plotting import BLUE, INK, legend_above, logarithmic, pyplot, save
 

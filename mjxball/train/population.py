@@ -25,7 +25,7 @@ from mjxball.train.program import Statistics, TrainingProgram, TrainState, repor
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
-class Carried:
+class FlatState:
     """A state and its statistics as a flat list of arrays, which compiled functions update.
 
     Flattening and rebuilding the trees at every call would slow training on a GPU by a quarter.
@@ -44,8 +44,8 @@ class Compiled(NamedTuple):
 
     begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `TrainingProgram.begin`
     episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `TrainingProgram.episodes`
-    collect: Callable[[Carried, TrainingPhase], Array]  # -> keys for `update`
-    update: Callable[[Carried, Array], list[Array]]  # -> the algorithm's metrics, by name
+    collect: Callable[[FlatState, TrainingPhase], Array]  # -> keys for `update`
+    update: Callable[[FlatState, Array], list[Array]]  # -> the algorithm's metrics, by name
     wait: Callable[[], Any]  # wait until all are compiled; raises errors of their compilation
 
 

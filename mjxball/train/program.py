@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MATMUL_PRECISION = "highest"  # float32 throughout: by default GPUs round products to TF32
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
-EVALUATION_DRAW = 20_261_121  # folded into the key, so that no seed trains on the evaluation's environments
+EVALUATION_SEED = 20_261_121  # folded into the key, so that no seed trains on the evaluation's environments
 
 
 class Statistics(NamedTuple):
@@ -226,7 +226,7 @@ class Environments:
 
 
 class Mode(NamedTuple):
-    """Number of steps and phase of a call of `TrainingProgram.advance`. Both are traced: one executable serves all modes."""
+    """Number of steps and phase of a call of `TrainingProgram.advance`. Both are traced: one executable serves all."""
 
     steps: Int[Array | np.ndarray, ""]  # of each environment
     phase: TrainingPhase
@@ -305,7 +305,7 @@ class TrainingProgram:
         Episodes of training are staggered, so that they do not end together.
         """
         _, env_key, stagger_key, _ = jax.random.split(key, 4)
-        reset_key = jnp.where(training, env_key, jax.random.fold_in(key, EVALUATION_DRAW))
+        reset_key = jnp.where(training, env_key, jax.random.fold_in(key, EVALUATION_SEED))
         envs = self.environments.reset(reset_key)
         staggered = self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps)
         return jax.tree.map(lambda new, old: jnp.where(training, new, old), staggered, envs)

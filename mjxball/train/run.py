@@ -21,7 +21,7 @@ from mjxball.config import Config
 from mjxball.errors import TrainingDivergedError
 from mjxball.policy import save_file
 from mjxball.policy.export import is_sound, network_file, policy_file
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 from mjxball.train import lock, processes
 from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
@@ -305,7 +305,7 @@ class Run:
             if not is_pair(self.population.program.env):  # a policy file has the layout of our observation
                 exported |= network_file(self._network_path(member), learnt, steps, origin)
                 continue
-            policy = policy_file(config, follower_law(config), learnt, steps, origin)
+            policy = policy_file(config, follower_controller(config), learnt, steps, origin)
             if not is_sound(policy):
                 continue
             exported = True

@@ -20,7 +20,7 @@ from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.files import MissingFileError, read_bytes, read_text, write_whole
+from mjxball.files import MissingFileError, read_bytes, read_text, write_atomically
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.container import MAX_BYTES
 from mjxball.policy.file import PolicyFile, load_file
@@ -81,7 +81,7 @@ def write_rows(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any
     writer = csv.DictWriter(stream, names)
     writer.writeheader()
     writer.writerows(rows)
-    write_whole(path, stream.getvalue())
+    write_atomically(path, stream.getvalue())
 
 
 def _refusal(path: Path, called: str, why: object) -> InputError:
@@ -108,7 +108,7 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     if file_hash(path) != start["sha256"]:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
     needed = parse_json(json.dumps(configs.to_dict(config)["follower"]))
-    trained = contents.card.get("config", {}).get("follower", {})
+    trained = contents.metadata.get("config", {}).get("follower", {})
     changed = [f"follower.{name}" for name in needed if needed[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
@@ -137,7 +137,7 @@ def file_hash(path: Path) -> str:
 def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
     """Write the run's `config.json`: configuration, its hash, and `origin` (seed, physics, command, commit)."""
     record = {"config": configs.to_dict(config), "config_hash": configs.config_hash(config), **origin}
-    write_whole(run / CONFIG_FILE, json.dumps(record, indent=2) + "\n")
+    write_atomically(run / CONFIG_FILE, json.dumps(record, indent=2) + "\n")
 
 
 def read_config(run: Path) -> tuple[Config, dict[str, Any]]:

@@ -133,7 +133,7 @@ def _evaluations(run: Path, origin: dict[str, Any]) -> list[dict[str, Any]]:
 def _policies(run: Path, origin: dict[str, Any]) -> dict[int, PolicyFile]:
     """Policy files by seed. Raises InputError unless every seed of the run has one."""
     files = [run / POLICY] if origin["seeds"] == 1 else members_of(run)
-    policies: dict[Any, PolicyFile] = {policy.card.get("seed"): policy for policy in map(load_file, files)}
+    policies: dict[Any, PolicyFile] = {policy.metadata.get("seed"): policy for policy in map(load_file, files)}
     seeds = range(origin["seed"], origin["seed"] + origin["seeds"])
     if set(policies) != set(seeds):
         raise InputError(f"{run} must hold the policies of seeds {seeds[0]} to {seeds[-1]}")

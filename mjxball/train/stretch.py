@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from mjxball.train.population import Carried, Compiled, Population
+from mjxball.train.population import Compiled, FlatState, Population
 from mjxball.train.program import Mode, Statistics, TrainState
 
 
@@ -30,7 +30,7 @@ def advance(
     On accelerators it returns before the devices are done. The buffers of `state` are donated.
     """
     phase, window = population.place_phase(mode.phase), population.program.algorithm.steps_per_collect
-    carried = Carried(state, population.no_statistics())
+    carried = FlatState(state, population.no_statistics())
     metrics, taken = population.no_metrics(), 0
     while taken < int(mode.steps):
         keys = compiled.collect(carried, phase)

@@ -21,7 +21,7 @@ from mjxball import config as configs
 from mjxball.cli import plant_setup
 from mjxball.config import Plant
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
@@ -93,7 +93,7 @@ def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
     stream = BytesIO()
     arrays: dict[str, Any] = {name: array.astype(np.float32) for name, array in flight.arrays.items() if name != "time"}
     np.savez_compressed(stream, about=np.array(json.dumps(about)), time=flight["time"], **arrays)
-    write_whole(path, stream.getvalue())
+    write_atomically(path, stream.getvalue())
 
 
 def load_flight(path: str | os.PathLike[str]) -> Flight:
@@ -189,16 +189,16 @@ def _without_hidden(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _simulated(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:
     """The simulated flight of the follower `source`, see `flight_from`."""
-    from mjxball.baselines import LAWS
-    from mjxball.evaluate.followers import find_follower
+    from mjxball.baselines import CONTROLLERS
+    from mjxball.evaluate.followers import follower_factory
     from mjxball.evaluate.policies import load_policy, native_config
     from mjxball.evaluate.scenarios import standard_scenarios
     from mjxball.sim.rollout import simulate
 
     setup, path = plant_setup(plant), Path(source)
     tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-    if source in LAWS or (":" in source and not path.exists() and path.suffix != ".npz"):
-        follower: Any = find_follower(source, "python -m mjxball.view")[1](setup)
+    if source in CONTROLLERS or (":" in source and not path.exists() and path.suffix != ".npz"):
+        follower: Any = follower_factory(source, "python -m mjxball.view")[1](setup)
     else:
         file = _policy_file(path)
         native = native_config(file)
@@ -239,6 +239,8 @@ def _policy_file(path: Path) -> Path:
         return path / "policy.npz"
     if path.suffix == ".npz":
         return path
-    from mjxball.baselines import LAWS
+    from mjxball.baselines import CONTROLLERS
 
-    raise InputError(f"{path} is no flight, policy file, run directory, module:Class or one of {', '.join(LAWS)}")
+    raise InputError(
+        f"{path} is no flight, policy file, run directory, module:Class or one of {', '.join(CONTROLLERS)}"
+    )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mjxball.cli import Parser, make_parser, output_file, run_command
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.view.flight import Flight, flight_from, save_flight
 from mjxball.view.page import flight_page
 
@@ -79,14 +79,14 @@ def show(options: argparse.Namespace, flight_from: Callable[..., Flight]) -> int
         named = zip(options.source, flights, strict=True)
         flights = [dataclasses.replace(one, title=f"{Path(source).name}: {one.title}"[:200]) for source, one in named]
     if options.video:
-        write_whole(options.video, _video(flights, options.video.suffix, options.speed or 1.0))
+        write_atomically(options.video, _video(flights, options.video.suffix, options.speed or 1.0))
         print(f"the video is {options.video}")  # noqa: T201
     if options.save:
         save_flight(options.save, flights[0])
         print(f"the flight is {options.save}")  # noqa: T201
     if options.out or not options.video:
         page = options.out or Path(tempfile.mkdtemp(prefix="mjxball-")) / "flight.html"
-        write_whole(page, flight_page(*flights).encode())
+        write_atomically(page, flight_page(*flights).encode())
         print(f"the page is {page}")  # noqa: T201
         if not options.out:
             webbrowser.open(page.as_uri())

@@ -4,7 +4,7 @@
 
 #include "core.h"
 
-#include "laws.h"
+#include "controllers.h"
 #include "rig.h"
 
 #define CEILING 60000.0f        /* [thrust units] */

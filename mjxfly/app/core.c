@@ -2,7 +2,7 @@
 #include "core.h"
 
 #include "checks.h"
-#include "laws.h"
+#include "controllers.h"
 #include "packets.h"
 #include "rig.h"
 

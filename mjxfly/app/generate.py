@@ -17,13 +17,13 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import APP, c_header, float_bytes, footprint, weight_bytes
-from mjxball.sim import laws
-from mjxfly import card, flight, setpoints, takeoff
+from mjxball.sim import controllers
+from mjxfly import flight, policy_setup, setpoints, takeoff
 from mjxfly.app.protocol import CAUSES
 from mjxfly.setpoints import CURVE_NAMES
 from mjxfly.telemetry import Rig
 
-CORE = ("core.h", "core.c", "checks.h", "laws.h", "packets.h")  # without firmware types
+CORE = ("core.h", "core.c", "checks.h", "controllers.h", "packets.h")  # without firmware types
 SOURCES = (*CORE, "glue.c")
 ROLES = ("leader", "follower")
 PERIODS = (5, 20)  # [ms] shortest and longest control period of an app
@@ -45,7 +45,7 @@ SAME = (
 )
 # Constants of the laptop's flight that the C files use by their names here, `rig.h` defines them.
 SHARED = {
-    laws: ("MAX_LIFT_DIFFERENCE", "WASHOUT_TIME"),
+    controllers: ("MAX_LIFT_DIFFERENCE", "WASHOUT_TIME"),
     setpoints: ("NEAR_GROUND", "BRAKE_TILT"),
     flight: ("LIFTED",),
     takeoff: (
@@ -68,44 +68,44 @@ def options(int8: bool) -> tuple[str, ...]:
 
 def key_of(policy: PolicyFile) -> int:
     """Return the compatibility key: a CRC of `SAME` and the weights' shapes, not of the weights."""
-    fields = {name: policy.card.get(name) for name in SAME}
+    fields = {name: policy.metadata.get(name) for name in SAME}
     shapes = [array.shape for array in (*policy.weights, *(policy.gru or ()))]
     return zlib.crc32(json.dumps([fields, shapes], sort_keys=True).encode())
 
 
-def ident_of(policy: PolicyFile, int8: bool) -> int:
+def weights_crc(policy: PolicyFile, int8: bool) -> int:
     """Return the CRC of the weights in their encoding on board."""
     return zlib.crc32(weight_bytes(policy) if int8 else float_bytes(policy))
 
 
 def check_policy(policy: PolicyFile, name: str) -> Config:
     """Return the configuration of a policy that can fly on board. Raises InputError for another plant or period."""
-    plant = policy.card["plant"]
+    plant = policy.metadata["plant"]
     drones = plant.get("drones", ())
-    if policy.card.get("firmware") is None or (drones and len(drones) != 2):
+    if policy.metadata.get("firmware") is None or (drones and len(drones) != 2):
         raise InputError(f"{name} is for another plant than a pair of Crazyflies, such as that of flight")
-    period = 1000 * float(policy.card["control_period"])
+    period = 1000 * float(policy.metadata["control_period"])
     if abs(period - round(period)) > 1e-6 or not PERIODS[0] <= round(period) <= PERIODS[1]:
         wanted = f"whole milliseconds from {PERIODS[0]} to {PERIODS[1]}"
         raise InputError(f"{name} has a control period of {period:g} ms; an app keeps {wanted}")
-    return card.config_of(policy.card)
+    return policy_setup.config_of(policy.metadata)
 
 
 def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
     """Return `rig.h`: parameters of both controllers and of the supervisor, and a sentence for each `CAUSES`."""
     leader, plant, stand = config.leader, config.plant, config.plant.stand != "free"
-    goal, rig = card.goal_of(config), Rig.of_plant(config.plant)
-    bounds = card.limits_of(config, goal)
-    variants = card.variants(config)
+    goal, rig = policy_setup.goal_of(config), Rig.of_plant(config.plant)
+    bounds = policy_setup.limits_of(config, goal)
+    variants = policy_setup.variants(config)
     axis = 0 if plant.cg_axis == "y" else 1
-    angle = card.mount_angle(policy.card)
+    angle = policy_setup.mount_angle(policy.metadata)
     first = next(iter(variants[0]))
     fields: dict[str, Any] = {
-        "ident": f"{ident_of(policy, int8)}u",
+        "ident": f"{weights_crc(policy, int8)}u",
         "key": f"{key_of(policy)}u",
         "period": round(1000 * config.timing.control_period),
         "mount": [rig.leader_mount, rig.follower_mount],
-        **({"mount_frame": [math.cos(angle), math.sin(angle)]} if "team" in policy.card else {}),
+        **({"mount_frame": [math.cos(angle), math.sin(angle)]} if "team" in policy.metadata else {}),
         "carried": [own[first].map.carried_mass for own in variants],
         "kp": leader.kp,
         "kd": leader.kd,
@@ -122,7 +122,7 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "goal": goal,
         "fence_low": bounds.fence_low,
         "fence_high": bounds.fence_high,
-        "land_spare": card.times_of(config).land_spare,
+        "land_spare": policy_setup.times_of(config).land_spare,
         "battery": bounds.battery,
         "maps": [_map(variants[0].get(name)) for name in CURVE_NAMES],
     }
@@ -174,11 +174,11 @@ def files_of(policy: PolicyFile, name: str, int8: bool) -> Mapping[str, str]:
     weights = "8 bit" if int8 else "float32"
     files["README.md"] = README.format(
         name=name,
-        hash=policy.card["config_hash"],
+        hash=policy.metadata["config_hash"],
         weights=weights,
         period=round(1000 * config.timing.control_period),
         flash=cost.flash,
-        ident=ident_of(policy, int8),
+        ident=weights_crc(policy, int8),
     )
     return files
 
@@ -227,7 +227,7 @@ Made by `python -m mjxfly.app POLICY DIR` (configuration {hash}, {weights} weigh
 constants, control period {period} ms, CRC of the weights {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`
-with `checks.h`, `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's
+with `checks.h`, `controllers.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's
 interface, `policy.h` and `rig.h` the policy.
 
     cd leader && make CRAZYFLIE_BASE=... cf2_defconfig && make CRAZYFLIE_BASE=... && make CRAZYFLIE_BASE=... cload

@@ -174,7 +174,7 @@ class App:
 
     @property
     def integral(self) -> Sequence[float]:
-        """(7,) integrals of the controllers, see `sim.laws.Laws`."""
+        """(7,) integrals of the controllers, see `sim.controllers.Controllers`."""
         return list(self._c.integral(self._core)[:7])
 
     @property

@@ -30,7 +30,7 @@ def _make(options: argparse.Namespace) -> int:
     """Write the apps; a policy for any rig uses the plant `crazyflie` by default."""
     check_place(options.place)
     policy, name, plant = contents_of(options.source), options.source.stem, options.plant
-    if plant is None and team.is_for_any(policy.card):
+    if plant is None and team.is_for_any(policy.metadata):
         plant = team.CRAZYFLIES
     drones = 2 if plant is None else plant_setup(plant).plant.count
     if drones != 2:

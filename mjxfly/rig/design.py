@@ -12,7 +12,7 @@ from mjxball import cli, pictures
 from mjxball.config import Config, cg_limit, thrust_over_weight, total_mass
 from mjxball.control.margins import unstable_axes
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.terminal import say
 
@@ -49,7 +49,7 @@ def _design(options: argparse.Namespace) -> int:
     for line in report(settings, held):
         say(line)
     if options.out:
-        write_whole(options.out, picture(settings, held))
+        write_atomically(options.out, picture(settings, held))
     return 0 if held >= 0 else 1
 
 

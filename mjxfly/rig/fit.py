@@ -17,7 +17,7 @@ from mjxball.control.axes import inertia_about_o
 from mjxball.control.crazyflie import PERIOD
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
-from mjxfly.card import motor_of
+from mjxfly.policy_setup import motor_of
 from mjxfly.rig.log import Log
 
 Array = np.ndarray

@@ -21,7 +21,7 @@ from mjxball.control.margins import (
     nominal_and_worst,
 )
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 
 PRESETS = ("flight", "stand")
 
@@ -54,7 +54,7 @@ def _gains(options: argparse.Namespace) -> int:
         raise InputError(f"{error}: a lighter or shorter stick, or faster motors, would help") from None
     print(report(designs, settings.plant.rotor_lag))  # noqa: T201
     if options.out:
-        write_whole(options.out, parameter_file(apply(settings.autopilot, designs)))
+        write_atomically(options.out, parameter_file(apply(settings.autopilot, designs)))
     return 0
 
 

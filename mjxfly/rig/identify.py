@@ -19,9 +19,9 @@ from mjxball.control.axes import inertia_about_o
 from mjxball.control.constants import hover
 from mjxball.control.crazyflie import PARAMETERS, THRUST_CEILING, PairGains, pair_gains
 from mjxball.errors import InputError
-from mjxball.files import write_whole
+from mjxball.files import write_atomically
 from mjxball.terminal import warn
-from mjxfly.card import with_curve
+from mjxfly.policy_setup import with_curve
 from mjxfly.preflight import read_gains
 from mjxfly.recording import one_curve, own_curve
 from mjxfly.rig.fit import LONGEST_DELAY, Estimate, identify, pair_mass
@@ -74,7 +74,7 @@ def _identify(options: argparse.Namespace) -> int:
         print(f"all {len(found)} logs\n{report(converted, mean)}")  # noqa: T201
     values = {**known, **conversion(settings, converted), **plant_settings(converted, mean)}
     if options.out:
-        write_whole(options.out, json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
+        write_atomically(options.out, json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
     config.validate(config.apply_overrides(settings, values))  # after writing: a rig too weak to fly keeps its file
     return 0
 

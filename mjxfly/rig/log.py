@@ -61,17 +61,17 @@ def read_log(path: Path, assumed: Config | None = None) -> Log:
 def make_log(
     sent_at: np.ndarray,
     setpoints: np.ndarray,
-    seen_at: np.ndarray | Sequence[np.ndarray],
+    measured_at: np.ndarray | Sequence[np.ndarray],
     states: Sequence[np.ndarray],
     guided: np.ndarray | None = None,
 ) -> Log:
-    """Resample setpoints (T, 2, 4) at times `sent_at` and both drones' `states` (S, 13) at times `seen_at`.
+    """Resample setpoints (T, 2, 4) at times `sent_at` and both drones' `states` (S, 13) at times `measured_at`.
 
     `guided` (T,) says at which setpoints the controllers were in command of a flight that starts on the ground; None
     means always, and in the air. Rows that are not finite are left out. Raises ValueError if shapes or values are wrong
     or the clocks of setpoints and states differ.
     """
-    times = [seen_at, seen_at] if isinstance(seen_at, np.ndarray) else list(seen_at)
+    times = [measured_at, measured_at] if isinstance(measured_at, np.ndarray) else list(measured_at)
     count = len(sent_at)
     if setpoints.shape != (count, 2, 4) or any(s.shape != (len(t), STATE) for s, t in zip(states, times, strict=True)):
         raise ValueError("shapes do not fit: time (T,), setpoints (T, 2, 4), states (T, 2, 13)")

@@ -23,7 +23,7 @@ from mjxball.errors import InputError
 from mjxball.terminal import say
 from mjxfly import clock
 from mjxfly.app.host import compile_pair
-from mjxfly.card import load_policy
+from mjxfly.policy_setup import load_policy
 from mjxfly.process import urgent
 from mjxfly.rehearsal import BEAT, LAST
 from mjxfly.telemetry import Rig
@@ -51,10 +51,10 @@ def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` describe until standard input ends; return the exit code."""
     clock.slow_down(options.slow)
     policy = load_policy(options.policy) if options.policy else None
-    card = policy.card if policy else None
+    metadata = policy.metadata if policy else None
     cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
     kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")
-    with urgent(), Twin(make_pair(card, kind, surroundings(options)), tuple(options.ports), cores) as twin:
+    with urgent(), Twin(make_pair(metadata, kind, surroundings(options)), tuple(options.ports), cores) as twin:
         worse = LinkFaults(options.loss, options.delay, options.jitter)
         links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
         waiting = [*links, *options.fault]
@@ -63,7 +63,7 @@ def serve(options: argparse.Namespace) -> int:
         report(uris=twin.uris)
         with contextlib.suppress(KeyboardInterrupt):
             report_until_end(twin)
-        weights = Rig.of_card(card).weights if card else (0.5, 0.5)
+        weights = Rig.from_metadata(metadata).weights if metadata else (0.5, 0.5)
         place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
         found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
         found["never"] = [one.text for one in waiting if one.text]

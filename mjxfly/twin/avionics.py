@@ -1,4 +1,4 @@
-"""Computers of both drones, from sensors to motor PWM (`Onboard`), and their batteries and motors (`Power`)."""
+"""`OnboardComputers` of both drones, from sensors to motor PWM, and their `BatteriesAndMotors`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PARAMETERS, gains_of, with_gains
 from mjxfly.twin.conditions import OLDER_FORCE, Battery, DroneKind, Surroundings
 from mjxfly.twin.estimators import Complementary, Imu, Kalman, euler_of
-from mjxfly.twin.pair import RUNNING, Modes, Report, remembered
+from mjxfly.twin.pair import RUNNING, Report, SupervisorOutputs, remembered
 from mjxfly.twin.parameters import COMPLEMENTARY, ESTIMATOR, KALMAN
 from mjxfly.twin.positioning import SWITCHES, Deck, positioning_of
 
@@ -19,7 +19,7 @@ FILTER_GAIN = 0.01  # of the firmware's low-pass filter of the voltage, at 1000 
 FILTER_START = 4.2  # [V]
 
 
-class Power:
+class BatteriesAndMotors:
     """Batteries of both drones, the firmware's filtered voltage and compensation, and the motors' force."""
 
     def __init__(self, kind: DroneKind, battery: Battery, strength: tuple[float, float]):
@@ -70,17 +70,17 @@ class Power:
 TICK = 2  # [ms] period of the cascade
 PREDICTION = 10  # [ms] period of the Kalman filter's predictions
 COMPLEMENTARY_PERIOD = 4  # [ms]
-# Parameters with an effect on `Onboard`, each with the index of the value that it sets.
+# Parameters with an effect on `OnboardComputers`, each with the index of the value that it sets.
 INITIAL = {f"kalman.initial{axis}": place for place, axis in enumerate("XYZ")}
 DEVIATIONS = {"locSrv.extPosStdDev": 0, "locSrv.extQuatStdDev": 1}
 RESET, IDLE = "kalman.resetEstimation", "powerDist.idleThrust"
 ACTED = frozenset({*PARAMETERS, *INITIAL, *DEVIATIONS, *SWITCHES, RESET, IDLE, ESTIMATOR})
 
 
-class Onboard:
+class OnboardComputers:
     """Both drones' sensors, estimators and controllers. Times in whole milliseconds since the start."""
 
-    def __init__(self, kind: DroneKind, surroundings: Surroundings, autopilot: Autopilot, power: Power):
+    def __init__(self, kind: DroneKind, surroundings: Surroundings, autopilot: Autopilot, power: BatteriesAndMotors):
         self.kind, self.surroundings, self.power = kind, surroundings, power
         random = np.random.default_rng([surroundings.seed, 7])
         self.imu = Imu(random, surroundings.noise)
@@ -161,7 +161,7 @@ class Onboard:
 
     # Every millisecond.
 
-    def order(self, setpoints: np.ndarray, modes: Modes) -> None:
+    def order(self, setpoints: np.ndarray, modes: SupervisorOutputs) -> None:
         """Set the `setpoints` (2, 4) and supervisor outputs that hold from now on."""
         self._setpoints, self._modes = setpoints, modes
 

@@ -106,7 +106,7 @@ def add_twin_options(parser: argparse._ActionsContainer) -> None:
     add("--twin-seed", type=int, metavar="N", help=f"{about}of its noise (0)")
 
 
-def check_twin(options: argparse.Namespace) -> None:
+def check_surroundings(options: argparse.Namespace) -> None:
     """Raise InputError for values out of range and combinations that the twin does not support."""
     for name, (low, high) in RANGES.items():
         value = getattr(options, f"twin_{name}")
@@ -128,7 +128,7 @@ def check_twin(options: argparse.Namespace) -> None:
         raise InputError(f"--twin-seed must not be negative, not {options.twin_seed}")
 
 
-def given_twin_options(options: argparse.Namespace) -> list[str]:
+def twin_arguments(options: argparse.Namespace) -> list[str]:
     """Return the --twin-... flags of `options` as arguments for the twin's process."""
     flags = []
     for name, value in vars(options).items():
@@ -140,7 +140,7 @@ def given_twin_options(options: argparse.Namespace) -> list[str]:
 
 def surroundings(options: argparse.Namespace) -> Surroundings:
     """Return the `Surroundings` that `options` describe. Raises InputError."""
-    check_twin(options)
+    check_surroundings(options)
     given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed", "gains")}
     given = {name: tuple(one) if name == "gains" else one for name, one in given.items() if one is not None}
     load = AddedLoad(*options.twin_load) if options.twin_load is not None else None
@@ -210,13 +210,13 @@ class BodyFault(NamedTuple):
     value: float
 
 
-What = LinkFaults | DroneFaults | BodyFault | str  # str: an action of the twin, see `TwinDrone.inject`
+FaultEffect = LinkFaults | DroneFaults | BodyFault | str  # str: an action of the twin, see `TwinDrone.inject`
 
 
 class FaultKind(NamedTuple):
     """A kind of `--fault KIND:DRONE@S`."""
 
-    what: What
+    what: FaultEffect
     about: str  # description for the documentation
 
 
@@ -254,7 +254,7 @@ FAULT_KINDS = {
 class Injection(NamedTuple):
     """A fault to inject during a rehearsal."""
 
-    what: What
+    what: FaultEffect
     drone: int  # 0 leader, 1 follower
     after: float  # time since the first motor turned [s]
     text: str = ""  # the value of --fault

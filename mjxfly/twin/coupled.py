@@ -20,10 +20,10 @@ from mjxball.control.crazyflie import with_stock_gains
 from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mujoco import slide_force
-from mjxball.physics.step import rotor_shares
-from mjxfly.twin.avionics import TICK, Onboard, Power
+from mjxball.physics.step import lag_weights
+from mjxfly.twin.avionics import TICK, BatteriesAndMotors, OnboardComputers
 from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
-from mjxfly.twin.pair import RUNNING, Modes, PairState
+from mjxfly.twin.pair import RUNNING, PairState, SupervisorOutputs
 
 STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
 LEG = 0.03  # [m] from a drone's centre down to the centre of its feet
@@ -51,11 +51,11 @@ def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
         for sensor in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
             spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu")
     model = spec.compile()
-    model.actuator_ctrllimited[:] = False  # `Power` limits the motors, by the battery's voltage
+    model.actuator_ctrllimited[:] = False  # `BatteriesAndMotors` limits the motors, by the battery's voltage
     return model
 
 
-def put_on(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> None:
+def attach_load(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> None:
     """Fix a point mass of `mass` [kg] to the stick of `model` at `offset` [m] from O, its centre, along the CG axis.
 
     Position and velocity of O do not change: the load moves with the stick when it is attached.
@@ -102,13 +102,13 @@ class CoupledPair:
         load = self.conditions
         mass, amplitude, speed, zero = map(np.float64, (load.object_mass, load.cg_amplitude, load.cg_speed, 0.0))
         self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))
-        self._keep, self._mean = rotor_shares(plant.rotor_lag * self.conditions.rotor_lag, None, STEP)
-        self.onboard = Onboard(kind, surroundings, with_stock_gains(config.autopilot), self._new_power())
+        self._keep, self._mean = lag_weights(plant.rotor_lag * self.conditions.rotor_lag, None, STEP)
+        self.onboard = OnboardComputers(kind, surroundings, with_stock_gains(config.autopilot), self._new_power())
         self.start()
 
-    def _new_power(self) -> Power:
+    def _new_power(self) -> BatteriesAndMotors:
         one, other = (a * b for a, b in zip(self.conditions.thrust, self.surroundings.gains, strict=True))
-        return Power(self.kind, self.conditions.battery, (one, other))
+        return BatteriesAndMotors(self.kind, self.conditions.battery, (one, other))
 
     def start(self) -> PairState:
         """See `Pair.start`."""
@@ -169,7 +169,7 @@ class CoupledPair:
             case _:
                 self.onboard.positioning[drone].disturb(what, value)
 
-    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+    def advance(self, setpoints: np.ndarray, dt: float, modes: SupervisorOutputs = RUNNING) -> PairState:
         """See `Pair.advance`. Steps are whole milliseconds; the rest of `dt` is carried over to the next call."""
         self._time_left += dt
         self.onboard.order(np.asarray(setpoints, float), modes)
@@ -183,7 +183,7 @@ class CoupledPair:
         model, data = self.model, self.data
         load = self.surroundings.load
         if load is not None and not self._loaded and self._moving and self._flown >= load.after:
-            put_on(model, self.config.plant, load.mass, load.offset)
+            attach_load(model, self.config.plant, load.mass, load.offset)
             self._loaded = True
         mujoco.mj_step1(model, data)
         if self._steps % TICK == 0:

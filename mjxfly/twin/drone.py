@@ -15,10 +15,10 @@ from mjxfly.app.host import App, Library, OnboardState
 from mjxfly.app.protocol import CONTROLLER, GROUP, OUT_OF_TREE, PID
 from mjxfly.packets import ZERO, Setpoint
 from mjxfly.twin import avionics
-from mjxfly.twin.conditions import FAULT_KINDS, BodyFault, DroneFaults, LinkFaults, What
+from mjxfly.twin.conditions import FAULT_KINDS, BodyFault, DroneFaults, FaultEffect, LinkFaults
 from mjxfly.twin.firmware import Firmware, Motors, Order
 from mjxfly.twin.logs import Readings, Snapshot
-from mjxfly.twin.pair import Modes, Pair, PairState
+from mjxfly.twin.pair import Pair, PairState, SupervisorOutputs
 from mjxfly.twin.parameters import ESTIMATOR, KALMAN, OF_APP, PARAMETERS
 from mjxfly.twin.positioning import DECKS
 from mjxfly.twin.protocol import Peer
@@ -101,7 +101,7 @@ class TwinDrone:
     def _silent(self) -> bool:
         return self.faults.stopped or self.firmware.dead or self.firmware.booting
 
-    def inject(self, what: What) -> None:
+    def inject(self, what: FaultEffect) -> None:
         """Inject a fault; "port" is handled by the server. Raises InputError for what is no fault."""
         if what not in [kind.what for kind in FAULT_KINDS.values()]:
             raise InputError(f"{what!r} is no fault; expected FAULT_KINDS[kind].what, kind of {', '.join(FAULT_KINDS)}")
@@ -267,7 +267,7 @@ def advance(pair: Pair, drones: tuple[TwinDrone, TwinDrone], state: PairState, n
         if drone.beat and not drone.faults.peer_silent:
             peer.hear(drone.beat, now)
         drone.beat = b""
-    modes = Modes(
+    modes = SupervisorOutputs(
         run=(one.motors is not Motors.OFF, other.motors is not Motors.OFF),
         held=(one.motors is Motors.HELD, other.motors is Motors.HELD),
         flying=(one.flying, other.flying),

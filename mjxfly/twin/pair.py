@@ -43,7 +43,7 @@ class PairState(NamedTuple):
     report: Report
 
 
-class Modes(NamedTuple):
+class SupervisorOutputs(NamedTuple):
     """Outputs of the firmware's supervisors of leader and follower."""
 
     run: tuple[bool, bool] = (True, True)  # motors turn, at idle at least; else their PWM is 0
@@ -51,7 +51,7 @@ class Modes(NamedTuple):
     flying: tuple[bool, bool] = (True, True)
 
 
-RUNNING = Modes()
+RUNNING = SupervisorOutputs()
 
 
 class Pair(Protocol):
@@ -77,7 +77,7 @@ class Pair(Protocol):
         """Reset everything to rest on the ground (stand: at its lowest position) and return that state."""
         ...
 
-    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+    def advance(self, setpoints: np.ndarray, dt: float, modes: SupervisorOutputs = RUNNING) -> PairState:
         """Simulate `dt` [s] under `setpoints` (2, 4) and return the new state.
 
         A row is (roll [deg], pitch [deg], yaw rate [deg/s], thrust 0 .. 65535) as decoded from the wire: negative

@@ -1,4 +1,4 @@
-"""`StandIn`, a simple model of a pair without MuJoCo, and the choice of the model for a policy."""
+"""`SimplePair`, a simple model of a pair without MuJoCo, and the choice of the model for a policy."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.control import motors, rotations
 from mjxball.errors import InputError
-from mjxfly.card import config_of, is_crazyflie
 from mjxfly.packets import Setpoint, angles
+from mjxfly.policy_setup import config_of, is_crazyflie
 from mjxfly.setpoints import ForceCurve
 from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
-from mjxfly.twin.pair import RUNNING, Modes, Pair, PairState, Report, remembered
+from mjxfly.twin.pair import RUNNING, Pair, PairState, Report, SupervisorOutputs, remembered
 
 CURVE = ForceCurve()
 # Standard deviations of the reported states: the flight's checks take a stream that repeats exactly for a frozen one.
@@ -25,8 +25,8 @@ FASTEST = 30.0  # [rad/s] bound on the body rates; the second-order attitude mod
 
 
 @dataclass(frozen=True)
-class StandInPlant:
-    """Parameters of `StandIn`."""
+class SimplePlant:
+    """Parameters of `SimplePair`."""
 
     mass: float = 0.07  # total [kg]
     mounts: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.0, -0.15, 0.0), (0.0, 0.15, 0.0))  # [m]
@@ -41,7 +41,7 @@ class StandInPlant:
     drain: float = 0.0008  # at full thrust [V/s]
 
 
-class StandIn:
+class SimplePair:
     """Implements `Pair` by one rigid body with second-order attitude dynamics, thrust lag and batteries."""
 
     cg_offset = math.nan
@@ -49,7 +49,7 @@ class StandIn:
 
     def __init__(
         self,
-        plant: StandInPlant = StandInPlant(),
+        plant: SimplePlant = SimplePlant(),
         kind: DroneKind = DELIVERED,
         surroundings: Surroundings = QUIET,
     ):
@@ -80,7 +80,7 @@ class StandIn:
         if what == "battery":
             self._charge[drone] = value
 
-    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+    def advance(self, setpoints: np.ndarray, dt: float, modes: SupervisorOutputs = RUNNING) -> PairState:
         """See `Pair.advance`; a drone whose stabilizer hangs keeps its thrust and levels out."""
         plant = self.plant
         held = np.array(modes.held)[:, None]
@@ -157,11 +157,13 @@ class StandIn:
 
 
 def make_pair(
-    card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, surroundings: Surroundings = QUIET
+    metadata: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, surroundings: Surroundings = QUIET
 ) -> Pair:
-    """Return the physics of the rig in a policy's metadata `card`; without it, the default `StandIn`."""
+    """Return the physics of the rig in a policy's metadata `card`; without it, the default `SimplePair`."""
     return (
-        StandIn(kind=kind, surroundings=surroundings) if card is None else pair_of(config_of(card), kind, surroundings)
+        SimplePair(kind=kind, surroundings=surroundings)
+        if metadata is None
+        else pair_of(config_of(metadata), kind, surroundings)
     )
 
 
@@ -171,14 +173,14 @@ def pair_of(
     surroundings: Surroundings = QUIET,
     conditions: Conditions | None = None,
 ) -> Pair:
-    """Return the physics of the rig of `config`: `CoupledPair` for Crazyflies, else `StandIn`.
+    """Return the physics of the rig of `config`: `CoupledPair` for Crazyflies, else `SimplePair`.
 
     MuJoCo is imported only if needed. Raises InputError if it is not installed.
     """
     if not is_crazyflie(config):
         leader, follower = config.plant.pair
         mounts = (leader.mount, follower.mount)
-        return StandIn(StandInPlant(mounts=mounts), kind, surroundings)
+        return SimplePair(SimplePlant(mounts=mounts), kind, surroundings)
     try:
         from mjxfly.twin.coupled import CoupledPair
     except ModuleNotFoundError as error:

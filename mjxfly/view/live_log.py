@@ -12,11 +12,11 @@ from mjxball.control import rotations
 from mjxball.view.flight import Mark
 from mjxball.view.page import plant_of
 from mjxfly import packets
-from mjxfly.card import variants
 from mjxfly.flight_log import Tail
 from mjxfly.limits import NAMES
 from mjxfly.log_schema import Record
 from mjxfly.packets import DroneState
+from mjxfly.policy_setup import variants
 from mjxfly.recording import LONGEST, FirmwareSetup
 from mjxfly.supervisor import FlightState
 from mjxfly.telemetry import Rig, object_state

@@ -19,7 +19,7 @@ from conftest import with_settings
 from tables import weekly
 
 from mjxball.algorithms.base import Shards, TrainingPhase
-from mjxball.algorithms.gradient import FirstOrderGradient, starts_anew
+from mjxball.algorithms.gradient import FirstOrderGradient, begins_episode
 from mjxball.commands.train import main
 from mjxball.config import Config, preset
 from mjxball.env import TransportEnv
@@ -27,7 +27,7 @@ from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.policy.export import policy_file
 from mjxball.policy.file import PolicyFile, load_file, shipped_policy
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
 from mjxball.train.program import Environments, TrainingProgram
@@ -307,14 +307,14 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(
         np.testing.assert_allclose(other, one, atol=1e-6)
     np.testing.assert_allclose(after.observation_mean, before.observation_mean, atol=1e-6)
     np.testing.assert_allclose(after.observation_scale, before.observation_scale, rtol=1e-3)
-    assert after.card["start_from"]["policy"] == "run/policy.npz"
+    assert after.metadata["start_from"]["policy"] == "run/policy.npz"
     assert main([*flags, "--start-from", "run", "--seed", "5", "--out", "each"]) == 0
     for seed in (0, 1):
         paths = f"run/members/seed{seed}.npz", f"each/members/seed{5 + seed}.npz"
         before, after = (load_file(Path(path)) for path in paths)
         for one, other in zip(layers_of(before, seen), layers_of(after, seen), strict=True):
             np.testing.assert_allclose(other, one, atol=1e-6)
-        assert after.card["start_from"]["policy"] == f"run/members/seed{seed}.npz"
+        assert after.metadata["start_from"]["policy"] == f"run/members/seed{seed}.npz"
     assert main([*flags, "--num-seeds", "3", "--start-from", "run", "--out", "other"]) == 2
     assert "say --num-seeds 2" in capsys.readouterr().err
 
@@ -323,7 +323,7 @@ def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
     """A policy file, made into what is trained and back, gives the same commands to float32."""
     algorithm = FirstOrderGradient(recurrent.config, Environments(TransportEnv(recurrent.config, "newton-euler"), 4))
     begun = algorithm.start_from(algorithm.init(jax.random.key(0)), recurrent.contents)
-    again = policy_file(recurrent.config, follower_law(recurrent.config), algorithm.policy(begun), steps=0)
+    again = policy_file(recurrent.config, follower_controller(recurrent.config), algorithm.policy(begun), steps=0)
     observations = np.random.default_rng(1).normal(size=(50, 18))
     old, new = (Policy(one, "one", np.float64) for one in (recurrent.contents, again))
     np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)
@@ -332,7 +332,7 @@ def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
 def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:
     path = shipped_policy("universal")
     start = {"policy": str(path), "sha256": file_hash(path)}
-    assert start_policy(start, preset("universal")).card["preset"] == "universal"
+    assert start_policy(start, preset("universal")).metadata["preset"] == "universal"
     with pytest.raises(InputError, match="SHA-256 has changed"):
         start_policy({**start, "sha256": "0" * 64}, preset("universal"))
 
@@ -365,13 +365,13 @@ def test_what_does_not_fit_is_refused(
 
 def test_environments_have_episodes_of_each_length_and_begin_them_in_turn():
     turn = np.arange(48)
-    begins = np.array([starts_anew(turn, windows, (3, 8)) for windows in range(48)])
+    begins = np.array([begins_episode(turn, windows, (3, 8)) for windows in range(48)])
     for place, length in ((0, 3), (1, 8)):
         gaps = [np.diff(np.flatnonzero(begins[:, number])) for number in turn[place::2]]
         assert {int(gap) for one in gaps for gap in one} == {length}
         each = begins[:, place::2].sum(axis=1)
         assert each.max() - each.min() <= 1, "as many begin in every window"
     assert (
-        np.array([starts_anew(turn, windows, (4,)) for windows in range(8)])
+        np.array([begins_episode(turn, windows, (4,)) for windows in range(8)])
         == ((turn + np.arange(8)[:, None]) % 4 == 0)
     ).all()

@@ -28,7 +28,7 @@ from mjxball.control.network import gru_cell
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
-from mjxball.policy.inference import NetworkLaw
+from mjxball.policy.inference import NetworkController
 from mjxball.train.program import Environments
 
 UNITS = 7
@@ -52,20 +52,20 @@ def test_training_and_file_answer_alike(recurrent: Recurrent) -> None:
     """In flight after flight: action, state and command of the network in training, the batch law and `Policy`."""
     env = TransportEnv(recurrent.config, "newton-euler")
     policy, exact = Policy(recurrent.contents, "one"), Policy(recurrent.contents, "one", np.float64)
-    law = NetworkLaw(exact)
+    controller = NetworkController(exact)
     with jax.default_matmul_precision("highest"):
         step, network = jax.jit(env.step), jax.jit(recurrent.network.__call__)
         for seed in (0, 1):
             state = jax.jit(env.reset)(jax.random.key(seed))
             policy.reset(), exact.reset()
-            memory = law.start(np.asarray(state.obs[:18], float))
+            memory = controller.start(np.asarray(state.obs[:18], float))
             for _ in range(30):
                 answer, seen = np.asarray(network(state.obs)), np.asarray(state.obs[:18], float)
                 state = step(state, answer)
                 commands = np.array([policy(seen), exact(seen)])
                 np.testing.assert_allclose(commands[0], state.pipeline_state.command, atol=2e-5)  # float32, 30 steps
                 np.testing.assert_allclose(policy.memory[-UNITS:], answer[3:], atol=2e-5)
-                memory, command = law.step(memory, seen, None)
+                memory, command = controller.step(memory, seen, None)
                 np.testing.assert_allclose(command, commands[1], atol=1e-12)
                 np.testing.assert_allclose(memory, exact.memory, atol=1e-12)
             assert np.abs(answer[3:]).max() > 0.1
@@ -247,7 +247,7 @@ def test_batches_hold_whole_sequences(transport: Config, tmp_path: Path, capsys:
 
 
 @rows(
-    "card, arrays, words",
+    "metadata, arrays, words",
     [
         ({"recurrent_units": None}, {}, "recurrent_units"),
         ({"recurrent_units": 6}, {}, "weight_0|gru_kernel"),
@@ -260,13 +260,13 @@ def test_batches_hold_whole_sequences(transport: Config, tmp_path: Path, capsys:
     ],
 )
 def test_a_damaged_file_is_refused(
-    card: dict[str, Any], arrays: dict[str, Any], words: str, recurrent: Recurrent, tmp_path: Path
+    metadata: dict[str, Any], arrays: dict[str, Any], words: str, recurrent: Recurrent, tmp_path: Path
 ) -> None:
     path = tmp_path / "policy.npz"
     save_file(path, recurrent.contents)
     with np.load(path) as data:
         held: dict[str, Any] = {**{name: data[name] for name in data.files}, **arrays}
-    whole = {**json.loads(str(held["card"])), **card}
+    whole = {**json.loads(str(held["card"])), **metadata}
     held["card"] = np.array(json.dumps({name: value for name, value in whole.items() if value is not None}))
     np.savez(path, **{name: array for name, array in held.items() if array is not None})
     with pytest.raises(PolicyFileError, match=words):
@@ -330,7 +330,7 @@ def test_a_run_writes_a_policy_resumes_bit_for_bit_and_starts_another(
     flags += ["--gradient.num_evaluations", "2", "--gradient.gradient_steps", "4"]
     assert main([*flags, "--out", "run"]) == 0
     whole = load_file(Path("run/policy.npz"))
-    assert (whole.card["format_version"], whole.card["recurrent_units"]) == (5, 3)
+    assert (whole.metadata["format_version"], whole.metadata["recurrent_units"]) == (5, 3)
     last = max((path for path in Path("run/checkpoints").iterdir() if path.name.isdigit()), key=lambda p: int(p.name))
     for path in sorted(last.rglob("*"), reverse=True):  # as if it had been stopped before
         path.rmdir() if path.is_dir() else path.unlink()

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mjxball.baselines import LAWS, linear, lqg, make_baseline, make_law
+from mjxball.baselines import CONTROLLERS, linear, lqg, make_baseline, make_controller
 from mjxball.baselines.assembly_model import assembly_model, ideal_model
 from mjxball.baselines.motion import disturbance_filter, noise, position_gains
 from mjxball.config import preset, replace
@@ -38,7 +38,7 @@ REFERENCE_NUMBERS = {
 def cells() -> dict[tuple[str, float], Result]:
     """Every baseline at every speed, closed-form physics."""
     config = preset("paper")
-    followers = [make_baseline(name, config) for name in LAWS]
+    followers = [make_baseline(name, config) for name in CONTROLLERS]
     flown = fly_scenarios(config, followers, cross(SPEEDS, [0.05], [0.2]), "newton-euler")
     return {(cell.follower, cell.scenario.omega): cell for cell in flown}
 
@@ -83,17 +83,17 @@ def test_only_the_slow_filter_bears_late_commands() -> None:
     assert flown[1].settling_time == pytest.approx(2.3, abs=0.3)
 
 
-@pytest.mark.parametrize("law", [lqg.Lqg, lqg.SlowLqg])
-def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]) -> None:
+@pytest.mark.parametrize("controller", [lqg.Lqg, lqg.SlowLqg])
+def test_feedback_is_that_of_the_hamiltonians_stable_subspace(controller: type[lqg.Lqg]) -> None:
     plant = ideal_model(preset("paper"), "lqg")
     wn, zeta, g = 10.0, 0.9, 9.81
     a = np.array([[0, 1, 0, 0], [0, 0, g, 0], [0, 0, 0, 1], [0, 0, -wn * wn, -2 * zeta * wn]])
     b = np.array([[0.0], [0], [0], [wn * wn]])
-    q, r = np.diag([law.tuning.position**-2, law.tuning.velocity**-2, 0.0, 0.0]), np.array([[0.15**-2]])
+    q, r = np.diag([controller.tuning.position**-2, controller.tuning.velocity**-2, 0.0, 0.0]), np.array([[0.15**-2]])
     values, vectors = np.linalg.eig(np.block([[a, -b @ b.T / r], [-q, -a.T]]))
     stable = vectors[:, values.real < 0]
     cost = np.real(stable[4:] @ np.linalg.inv(stable[:4]))
-    far, back = position_gains(plant, law.tuning)[:, 1]
+    far, back = position_gains(plant, controller.tuning)[:, 1]
     found = [far[12], far[15], -back[4], -back[10]]
     np.testing.assert_allclose(found, (b.T @ cost / r)[0], rtol=1e-9)
 
@@ -149,7 +149,7 @@ def test_gains_follow_the_plant() -> None:
 
 def test_stands_are_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match="that fly freely"):
-        make_law("lqg", replace(preset("paper"), "plant.stand", "heave"))
+        make_controller("lqg", replace(preset("paper"), "plant.stand", "heave"))
 
 
 def test_oracle_refuses_to_fly_without_being_told() -> None:
@@ -185,12 +185,12 @@ def test_observer_integrals_and_mpc_take_off_a_torque_and_a_mass_that_nobody_tol
 def test_the_observer_sees_a_step_of_torque_and_of_lift_by_its_time_constants() -> None:
     """1 - (1 - w T)^k of it after k periods T, whatever the law itself commands."""
     config = preset("paper")
-    law, pair, observation = make_law("observer", config), assembly_model(config, "test"), np.zeros(18)
-    bandwidth = np.array([law.gains.torque_bandwidth, law.gains.lift_bandwidth])
-    step, state, seen = np.array([0.05 / pair.inertia[1], 0.4]), law.start(observation), []  # [rad/s2, m/s2]
+    controller, pair, observation = make_controller("observer", config), assembly_model(config, "test"), np.zeros(18)
+    bandwidth = np.array([controller.gains.torque_bandwidth, controller.gains.lift_bandwidth])
+    step, state, seen = np.array([0.05 / pair.inertia[1], 0.4]), controller.start(observation), []  # [rad/s2, m/s2]
     for _ in range(100):
         seen.append(bandwidth * (observation[10] - state.rate, -observation[CLIMB] - state.climb))
-        state, command = law.step(state, observation, None)
+        state, command = controller.step(state, observation, None)
         both = copy_command(observation, *copy_gains(config)) + command
         turn = pair.kp[1] * (both[1] - 2 * observation[4]) - 2 * pair.kd[1] * observation[10]
         observation[4] += pair.period * observation[10]
@@ -203,21 +203,21 @@ def test_the_observer_sees_a_step_of_torque_and_of_lift_by_its_time_constants() 
 def test_the_pids_integrals_stand_still_where_they_would_wind_up() -> None:
     """Far away the command is at its limits; of a small error it integrates `gain` times the error."""
     config, privileged = preset("paper"), None
-    law = make_law("pid", config)
-    gains, period = law.gains, config.timing.control_period
+    controller = make_controller("pid", config)
+    gains, period = controller.gains, config.timing.control_period
     resting = np.zeros(18)
     resting[4] = -1e-3  # pitch below the reference, which starts there
-    state = law.start(np.zeros(18))
-    moved, _ = law.step(state, resting, privileged)
+    state = controller.start(np.zeros(18))
+    moved, _ = controller.step(state, resting, privileged)
     assert moved.pitch == pytest.approx(period * gains.pitch_integral * 1e-3, rel=1e-9)
     diving = np.zeros(18)
     diving[4] = 0.9  # the command is at -0.6 rad, and the error asks for less
-    moved, command = law.step(state, diving, privileged)
+    moved, command = controller.step(state, diving, privileged)
     assert command[1] == -config.command.tilt_limit
     assert moved.pitch == 0.0
     nudged = state._replace(pitch=np.asarray(3.0))  # at the limit on the other side: the error brings it back
     diving[4] = 0.2
-    moved, command = law.step(nudged, diving, privileged)
+    moved, command = controller.step(nudged, diving, privileged)
     assert command[1] == config.command.tilt_limit
     assert moved.pitch == pytest.approx(3.0 - period * gains.pitch_integral * gains.pitch_band)
 
@@ -225,4 +225,4 @@ def test_the_pids_integrals_stand_still_where_they_would_wind_up() -> None:
 def test_observer_and_pid_are_of_the_pair() -> None:
     for name in ("observer", "pid"):
         with pytest.raises(InputError, match="free pair along x"):
-            make_law(name, preset("team"))
+            make_controller(name, preset("team"))

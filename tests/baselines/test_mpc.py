@@ -15,7 +15,7 @@ from tables import rows
 
 from batch import fly_compiled
 from mjxball import config as configs
-from mjxball.baselines import make_baseline, make_law
+from mjxball.baselines import make_baseline, make_controller
 from mjxball.baselines.motion import (
     EX,
     EY,
@@ -50,7 +50,7 @@ NOMINAL = MASSES.index(0.2)
 HOVER = np.array([1.1 * 9.81 / 4])  # [N] of each rotor, with 0.2 kg
 
 
-def law() -> MpcDesign:
+def controller() -> MpcDesign:
     return design(PAPER, TUNING, MASSES[NOMINAL])
 
 
@@ -68,7 +68,7 @@ def cost(own: MpcDesign, x: np.ndarray, corrections: np.ndarray) -> float:
 
 def test_a_correction_costs_its_square_on_top_of_the_lqr() -> None:
     """J = x'Px + sum of W v^2: without limits the best v is none, and the law the LQR."""
-    own, random = law(), np.random.default_rng(0)
+    own, random = controller(), np.random.default_rng(0)
     x, corrections = np.zeros(PAIR_STATES), 0.1 * random.normal(size=20)
     x[[EX, VX, PITCH]] = 0.4, -0.2, 0.05
     more = cost(own, x, corrections) - cost(own, x, np.zeros(0))
@@ -78,7 +78,7 @@ def test_a_correction_costs_its_square_on_top_of_the_lqr() -> None:
 @rows("plant", [PAPER, ring_config(TEAM, 3), with_plant(PAPER, "plate4")])
 def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
     """Every follower's command, in body axes; of a team each sees them turned."""
-    follower, mass = make_law("mpc", plant), plant.plant.object_mass
+    follower, mass = make_controller("mpc", plant), plant.plant.object_mass
     kind = round(10 * mass)
     own, seen, angles = follower.designs[kind], np.zeros(18), mount_angles(plant.plant)
     seen[12:15], seen[3:5] = (0.02, -0.01, 0.01), (0.005, -0.01)
@@ -101,7 +101,7 @@ def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
 @rows("drones", [3, 6])
 def test_the_plan_expects_what_a_turned_team_does(drones: int) -> None:
     """Roll and pitch of a ring are one law, turned, but for what uneven lifts turn: the leader is along x."""
-    own = make_law("mpc", ring_config(TEAM, drones)).designs[drones]
+    own = make_controller("mpc", ring_config(TEAM, drones)).designs[drones]
     along, across = [EX, VX, PITCH, PITCH_RATE, TORQUE], [EY, VY, ROLL, ROLL_RATE, ROLLING]
     signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])  # pitch nose down drives along +x, roll along -y
     np.testing.assert_allclose(own.feedback[1, along], signs * own.feedback[0, across], rtol=1e-6)
@@ -111,7 +111,7 @@ def test_the_plan_expects_what_a_turned_team_does(drones: int) -> None:
 def test_estimates_of_followers_that_measure_apart_are_forgotten() -> None:
     """Where all measure one motion, differences between them die out as the memory says, and no slower."""
     config, apart = ring_config(TEAM, 4), []
-    for own in make_law("mpc", config).designs:
+    for own in make_controller("mpc", config).designs:
         size = len(own.transition)
         kept = np.hstack([np.eye(size) - own.gain @ np.eye(size)[list(MEASURED)], np.zeros((size, 3))])
         sent = np.hstack([np.zeros((3, size)), np.eye(3)])  # the command before: measurements are taken to be late
@@ -123,7 +123,7 @@ def test_estimates_of_followers_that_measure_apart_are_forgotten() -> None:
 
 def test_the_program_is_solved_as_another_solver_does() -> None:
     """The same program with its slack eliminated, v'Wv + cost of what goes beyond, by L-BFGS."""
-    own, random = law(), np.random.default_rng(1)
+    own, random = controller(), np.random.default_rng(1)
     program, count = QuadraticProgram(own, LIMITS, MASSES[NOMINAL]), 3 * len(BLOCKS)
     states, rows, low, high, lifting = limit_rows(own, LIMITS, 1.1)
     weights = np.outer(BLOCKS, own.cost).ravel()
@@ -150,9 +150,9 @@ def test_the_program_is_solved_as_another_solver_does() -> None:
 @rows("plant", [PAPER, ring_config(TEAM, 4)])
 def test_limits_are_kept_that_the_lqr_breaks(plant: Config) -> None:
     """A metre away, on the linear model: tilt to 5 % of its limit, rotors to 0.6 N, by which clipping cuts."""
-    law, limits, mass = make_law("mpc", plant), limits_of(plant), plant.plant.object_mass
+    controller, limits, mass = make_controller("mpc", plant), limits_of(plant), plant.plant.object_mass
     kind = round(10 * mass)
-    own, tuning = law.designs[kind], law.team_tuning if plant.plant.is_team else law.tuning
+    own, tuning = controller.designs[kind], controller.team_tuning if plant.plant.is_team else controller.tuning
     program, carried = QuadraticProgram(own, limits, MASSES[kind]), limits.own_mass + limits.load_share * mass
     hover = np.array([carried * 9.81 / 4])
     for follows in (False, True):
@@ -208,12 +208,12 @@ def test_a_jax_program_calls_it_back(heavy) -> None:
     recorded = simulate_batch(PAPER, [(follower, heavy)], "newton-euler")
     for mine, other in zip(batched, measure_batch(recorded, 2.5, PAPER.plant.rotor_force_max, 0), strict=True):
         assert mine.rmse == pytest.approx(other.rmse, abs=1e-3)
-    assert follower.law.solved > 100
-    assert follower.law.failed == 0
+    assert follower.controller.solved > 100
+    assert follower.controller.failed == 0
 
 
 def test_it_has_no_derivative() -> None:
-    follower, zero = make_law("mpc", PAPER), jax.numpy.zeros(())
+    follower, zero = make_controller("mpc", PAPER), jax.numpy.zeros(())
     nobody = PrivilegedInfo(zero + 0.2, zero, zero, zero)
 
     def command(observation: jax.Array) -> jax.Array:
@@ -224,7 +224,7 @@ def test_it_has_no_derivative() -> None:
 
 
 def test_copies_solve_by_themselves(heavy) -> None:
-    follower = make_law("mpc", PAPER)
+    follower = make_controller("mpc", PAPER)
     observation = np.zeros(18)
     observation[12:15] = 1.0
     nobody = PrivilegedInfo(np.array(0.2), *[np.array(0.0)] * 3)
@@ -236,11 +236,11 @@ def test_copies_solve_by_themselves(heavy) -> None:
 
 def test_what_it_cannot_do_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="free pair along x"):
-        make_law("mpc", configs.replace(PAPER, "plant.cg_axis", "y"))
+        make_controller("mpc", configs.replace(PAPER, "plant.cg_axis", "y"))
     light = dataclasses.replace(TEAM.plant.drones[1], mass=0.8)
     drones = (TEAM.plant.drones[0], light, *TEAM.plant.drones[2:])
     with pytest.raises(InputError, match="drones that are alike"):
-        make_law("mpc", dataclasses.replace(TEAM, plant=dataclasses.replace(TEAM.plant, drones=drones)))
+        make_controller("mpc", dataclasses.replace(TEAM, plant=dataclasses.replace(TEAM.plant, drones=drones)))
     monkeypatch.setitem(sys.modules, "osqp", None)
     with pytest.raises(InputError, match=r"mjxball\[mpc\]"):
-        make_law("mpc", PAPER)
+        make_controller("mpc", PAPER)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjxball.baselines import make_baseline, make_law
+from mjxball.baselines import make_baseline, make_controller
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.sim.rollout import simulate
@@ -25,7 +25,7 @@ def estimates(mass: float, believed: float, offset: float) -> tuple[float, float
     )
     flown = simulate(preset("paper"), follower, scenario, "newton-euler")
     assert np.abs(flown.error[-1]).max() < 2e-4
-    _, torque, lift = follower.law.estimate(follower._state, flown.observation[-1])
+    _, torque, lift = follower.controller.estimate(follower._state, flown.observation[-1])
     return torque.item(), lift.item()
 
 
@@ -45,4 +45,4 @@ def test_it_finds_what_a_mass_that_nobody_knows_pulls():
 
 def test_other_plants_are_refused():
     with pytest.raises(InputError, match="free pair along x"):
-        make_law("lqg-offset-free", preset("flight"))
+        make_controller("lqg-offset-free", preset("flight"))

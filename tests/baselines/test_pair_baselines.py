@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjxball.baselines import crazyflie_lqg, linear, make_baseline, make_law
+from mjxball.baselines import crazyflie_lqg, linear, make_baseline, make_controller
 from mjxball.baselines.assembly_model import assembly_model
 from mjxball.baselines.crazyflie_lqg import linear_model
 from mjxball.config import apply_overrides, preset, replace
@@ -90,9 +90,13 @@ def test_model_moves_as_the_simulator(command: tuple[float, float]) -> None:
     x = np.zeros(len(model.names))
     for _ in range(30):
         known = dict(zip(model.names, x, strict=True))
-        law = config.leader
-        roll = (law.kp[1] * known["y"] + law.kd[1] * known["vy"]) / 9.81
-        vertical = law.ki[2] * known["leader_integral"] - law.kp[2] * known["height"] - law.kd[2] * known["climb"]
+        controller = config.leader
+        roll = (controller.kp[1] * known["y"] + controller.kd[1] * known["vy"]) / 9.81
+        vertical = (
+            controller.ki[2] * known["leader_integral"]
+            - controller.kp[2] * known["height"]
+            - controller.kd[2] * known["climb"]
+        )
         told = np.array([[[roll, 0.0, vertical], [command[0], 0.0, command[1]]]])
         state = step(state, told, load)
         x = transition @ x + drive @ np.array(command)
@@ -157,6 +161,6 @@ def test_lqg_brings_the_ball_back_on_the_stand() -> None:
 
 def test_what_does_not_fly_this_rig_says_so() -> None:
     with pytest.raises(InputError, match="ideal loops"):
-        make_law("memoryless", FLIGHT)
+        make_controller("memoryless", FLIGHT)
     with pytest.raises(InputError, match="along y"):
-        make_law("lqg", replace(FLIGHT, "plant.cg_axis", "x"))
+        make_controller("lqg", replace(FLIGHT, "plant.cg_axis", "x"))

@@ -11,7 +11,7 @@ from plants import team
 from tables import rows, weekly
 
 from batch import fly_compiled
-from mjxball.baselines import make_baseline, make_law
+from mjxball.baselines import make_baseline, make_controller
 from mjxball.baselines.assembly_model import assembly_model
 from mjxball.config import Attitude, Config, apply_overrides, preset, replace, with_plant
 from mjxball.control.followers import PrivilegedInfo
@@ -168,13 +168,15 @@ def test_who_knows_of_a_failure_holds_it() -> None:
 
 
 def test_with_a_known_failure_the_plan_is_at_once_for_those_that_are_left() -> None:
-    law = make_law("lqg-known-failures", STRONG)
+    controller = make_controller("lqg-known-failures", STRONG)
     mass, still, total = np.full(5, 0.6), np.zeros((5, 2)), np.full(5, 6.9)
     observation = np.zeros((5, 18))
     whole, less = np.ones((5, 6)), np.ones((5, 6))
     less[:, 3] = 0
     commands = [
-        law.step(law.start(observation), observation, PrivilegedInfo(mass, still, still, total, thrust))[1]
+        controller.step(controller.start(observation), observation, PrivilegedInfo(mass, still, still, total, thrust))[
+            1
+        ]
         for thrust in (whole, less)
     ]
     np.testing.assert_allclose(commands[0], 0, atol=1e-12)
@@ -199,6 +201,6 @@ def test_a_batch_of_a_team_equals_its_recorded_flights(name: str) -> None:
 def test_what_they_cannot_fly_is_refused() -> None:
     crazyflies = apply_overrides(preset("flight"), {"plant.cg_axis": "xy"})
     with pytest.raises(InputError, match="Crazyflies in pairs"):
-        make_law("adaptive", crazyflies)
+        make_controller("adaptive", crazyflies)
     with pytest.raises(InputError, match="ideal loops"):
-        make_law("memoryless", preset("flight"))
+        make_controller("memoryless", preset("flight"))

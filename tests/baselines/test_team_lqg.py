@@ -63,18 +63,18 @@ def test_turning_a_team_changes_nothing_that_its_followers_know() -> None:
 
 def test_what_enters_the_filter_is_the_mean_of_all_commands() -> None:
     """It lifts as the height's feedback asks, and tilts against what lifting more than the leader turns."""
-    law = TeamOffsetFree(ring(4))
+    controller = TeamOffsetFree(ring(4))
     observation = 0.05 * np.random.default_rng(0).standard_normal(18)
-    led, tilts = copy_command(observation, *law._leader), []
+    led, tilts = copy_command(observation, *controller._leader), []
     for lever in (np.zeros(2), np.array([0.01, -0.02])):
-        law.team = law.team._replace(lever=lever, room=np.array([9.0, 9.0]))
-        state = law.start(observation)
-        after, own = law.step(state, observation, None)
-        mean, (x, _, lift) = (led + 3 * own) / 4, law.estimate(state, observation)
-        assert mean[2] == pytest.approx(law.gains[0, 2] @ observation - lift, rel=1e-9)
+        controller.team = controller.team._replace(lever=lever, room=np.array([9.0, 9.0]))
+        state = controller.start(observation)
+        after, own = controller.step(state, observation, None)
+        mean, (x, _, lift) = (led + 3 * own) / 4, controller.estimate(state, observation)
+        assert mean[2] == pytest.approx(controller.gains[0, 2] @ observation - lift, rel=1e-9)
         tilts.append(mean[:2] + lever * (own - led)[2])  # with what the lift turns
         np.testing.assert_allclose(
-            after, law.filter.moved(x, np.array([*law.stiffness * tilts[-1], mean[2]])), rtol=1e-9
+            after, controller.filter.moved(x, np.array([*controller.stiffness * tilts[-1], mean[2]])), rtol=1e-9
         )
     np.testing.assert_allclose(tilts[1], tilts[0], rtol=1e-9)
 
@@ -87,7 +87,7 @@ def test_it_finds_the_loads_torque(count: int) -> None:
     scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=offset, mass=mass, seconds=12.0)
     flown = simulate(config, follower, scenario, ENGINE)
     assert np.abs(flown.error[-1]).max() < 5e-3
-    _, load, _ = follower.law.estimate(follower._state, flown.observation[-1])
+    _, load, _ = follower.controller.estimate(follower._state, flown.observation[-1])
     numbers = plant_parameters(config.plant, config.attitude)
     inertia = count * numbers.gains.kp[1] / 100
     found = np.linalg.norm(load[0], axis=-1)

@@ -9,7 +9,7 @@ import pytest
 from tables import weekly
 
 from batch import fly_compiled
-from mjxball.baselines import LAWS, make_baseline
+from mjxball.baselines import CONTROLLERS, make_baseline
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.evaluate.results import fly_scenarios
@@ -38,7 +38,7 @@ SCENARIOS = [
     ],
 )
 def test_batch_equals_recorded_flights(name: str) -> None:
-    follower = make_baseline(name, CONFIG) if name in LAWS else Policy.load(shipped_policy(name))
+    follower = make_baseline(name, CONFIG) if name in CONTROLLERS else Policy.load(shipped_policy(name))
     batched = fly_compiled(CONFIG, follower, SCENARIOS)
     recorded = [cell.metrics for cell in fly_scenarios(CONFIG, [follower], SCENARIOS, "newton-euler")]
     for mine, other in zip(batched, recorded, strict=True):

@@ -19,39 +19,39 @@ from mjxball.baselines import make_baseline
 from mjxball.cli import plant_setup
 from mjxball.commands import evaluate
 from mjxball.config import preset
-from mjxball.evaluate.policies import beyond_card, load_policy
+from mjxball.evaluate.policies import beyond_training, load_policy
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file, save_file, shipped_policies, shipped_policy
 from mjxball.sim.scenario import Scenario
 from mjxball.view import main as view
 
-CARD = {"flown": {"drones": [2, 3], "seconds": 60}}
+METADATA = {"flown": {"drones": [2, 3], "seconds": 60}}
 UNIVERSAL, FLIGHT = shipped_policy("universal"), shipped_policy("flight")
 MEASURED = REPOSITORY / "benchmarks" / "results" / "horizon.json"
 
 
 @rows(
-    "card, drones, seconds, words",
+    "metadata, drones, seconds, words",
     [
-        (CARD, 2, 60.0, ()),
-        (CARD, 3, 45.0, ()),
-        (CARD, 4, 45.0, (("2, 3", "are 4"),)),
-        (CARD, 2, 61.0, (("60 s", "61 s"),)),
-        (CARD, 6, 300.0, (("2, 3", "are 6"), ("60 s", "300 s"))),
+        (METADATA, 2, 60.0, ()),
+        (METADATA, 3, 45.0, ()),
+        (METADATA, 4, 45.0, (("2, 3", "are 4"),)),
+        (METADATA, 2, 61.0, (("60 s", "61 s"),)),
+        (METADATA, 6, 300.0, (("2, 3", "are 6"), ("60 s", "300 s"))),
         ({}, 6, 3600.0, ()),
     ],
 )
 def test_more_drones_or_a_longer_flight_are_beyond_a_card(
-    card: dict[str, Any], drones: int, seconds: float, words: tuple[tuple[str, str], ...]
+    metadata: dict[str, Any], drones: int, seconds: float, words: tuple[tuple[str, str], ...]
 ) -> None:
-    found = beyond_card(card, drones, seconds)
+    found = beyond_training(metadata, drones, seconds)
     assert len(found) == len(words)
     assert all(one in text and other in text for text, (one, other) in zip(found, words, strict=True))
 
 
 def test_the_evaluation_and_the_viewer_warn_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy, contents = tmp_path / "policy.npz", load_file(UNIVERSAL)
-    save_file(policy, dataclasses.replace(contents, card={**contents.card, **CARD}))
+    save_file(policy, dataclasses.replace(contents, metadata={**contents.metadata, **METADATA}))
     short = ["--seconds", 0.1, "--physics", "newton-euler", "--plant"]
     for plant, expected in (("team4", 1), ("team3", 0)):
         assert call(evaluate.main, [policy, *short, plant]) == 0
@@ -67,7 +67,7 @@ def test_cards_say_what_was_measured() -> None:
     """Of the lengths up to the card's, its numbers of drones are those all of whose flights were steady."""
     measured = json.loads(MEASURED.read_text())["rows"]
     for path in shipped_policies():
-        flown, mine = Policy.load(path).card["flown"], [row for row in measured if row["policy"] == path.stem]
+        flown, mine = Policy.load(path).metadata["flown"], [row for row in measured if row["policy"] == path.stem]
         within = [row for row in mine if row["seconds"] <= flown["seconds"]]
         unsteady = {row["drones"] for row in within if not row["steady"]}
         assert max(row["seconds"] for row in within) == flown["seconds"], path
@@ -91,7 +91,7 @@ def horizon() -> ModuleType:
 )
 def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
     """Its load at rest, and moving slowly and quickly: nothing is lost, and what its card is good for stays steady."""
-    flown = Policy.load(path).card["flown"]
+    flown = Policy.load(path).metadata["flown"]
     plants = [setup for _, setup in horizon.own_plants(path) if setup.plant.count in flown["drones"]]
     setup = max(plants, key=lambda one: one.plant.count)
     policy, lengths = load_policy(path, setup), (horizon.MINUTE, horizon.TEN)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stability
-from batch import law_of
+from batch import controller_of
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
 from mjxball.sim.disturbances import Disturbance
@@ -33,7 +33,7 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
 
     Of a mass that is not believed each drone holds half: z = dm g / (2 m^ kp), m^ what one drone believes to lift.
     """
-    *known, mistaken = linearised_hovers(paper, law_of(make_baseline("copy", paper)), [*CASES, MISTAKEN])
+    *known, mistaken = linearised_hovers(paper, controller_of(make_baseline("copy", paper)), [*CASES, MISTAKEN])
     for (offset, mass, _), hover in zip(CASES, known, strict=True):
         sway = 9.81 / 0.5 * mass * offset * 9.81 / (2 * 3.2196)
         assert hover.error == pytest.approx(sway, rel=1e-3, abs=1e-9)
@@ -47,7 +47,7 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
 def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
     """LQG, which is told of no delay, bears one control step and not two."""
     lqg, margin = make_baseline("lqg", paper), 1
-    hovers = [linearised_hovers(paper, law_of(lqg), CASES[:1], delay)[0] for delay in (margin, margin + 1)]
+    hovers = [linearised_hovers(paper, controller_of(lqg), CASES[:1], delay)[0] for delay in (margin, margin + 1)]
     assert [hover.stable for hover in hovers] == [True, False]
     still = {"amplitude": 0.0, "goal": (0.0, 0.0, 0.0), "start_position": (0.001, 0.0, 0.0)}
     delays = [0.02 * margin, 0.02 * (margin + 1)]
@@ -65,12 +65,12 @@ def test_the_margin_of_a_case_is_the_last_delay_before_its_first_unstable_one(
     stable = [(1, 1, 0, 0), (0, 0, 0, 0), (1, 0, 1, 1), (1, 1, 1, 0)]
     asked = []
 
-    def hovers(config: Config, law: Any, cases: Any, delay: int) -> list[SimpleNamespace]:
+    def hovers(config: Config, controller: Any, cases: Any, delay: int) -> list[SimpleNamespace]:
         asked.append(delay)
         return [SimpleNamespace(stable=bool(row[delay])) for row in stable[: len(cases)]]
 
     monkeypatch.setattr(stability, "linearised_hovers", hovers)
-    law = law_of(make_baseline("lqg", paper))
-    assert delay_margins(paper, law, [CASES[0]] * 4, longest=3) == [1, -1, 0, 2]
-    assert delay_margins(paper, law, CASES[:1], longest=3) == [1]
+    controller = controller_of(make_baseline("lqg", paper))
+    assert delay_margins(paper, controller, [CASES[0]] * 4, longest=3) == [1, -1, 0, 2]
+    assert delay_margins(paper, controller, CASES[:1], longest=3) == [1]
     assert asked == [0, 1, 2, 3, 0, 1, 2]  # no further than the first delay that nobody bears

@@ -229,9 +229,9 @@ def test_a_policy_meets_its_card_on_mjx(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_check_fails_a_policy_that_misses_its_card(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arrays, card = load_arrays()
-    card["bounds"]["x_peak"] = 1e-6
-    strict = write_arrays(tmp_path / "strict.npz", arrays, card)
+    arrays, metadata = load_arrays()
+    metadata["bounds"]["x_peak"] = 1e-6
+    strict = write_arrays(tmp_path / "strict.npz", arrays, metadata)
     assert call(main, [*FAST, strict, TRANSPORT, "--check"]) == 1
     printed = capsys.readouterr().out
     assert "check strict: x_peak" in printed
@@ -248,8 +248,8 @@ def test_policies_of_one_stem_are_called_by_their_directory(tmp_path: Path, caps
 
 
 def test_a_policy_for_another_rate_flies_only_when_forced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arrays, card = load_arrays(TRANSPORT)
-    write_arrays(tmp_path / "slow.npz", arrays, {**card, "control_period": 0.04})
+    arrays, metadata = load_arrays(TRANSPORT)
+    write_arrays(tmp_path / "slow.npz", arrays, {**metadata, "control_period": 0.04})
     flags = [tmp_path / "slow.npz", "--seconds", "1", *FAST]
     assert call(main, flags) == 2
     refusal = capsys.readouterr().err

@@ -83,15 +83,15 @@ def test_bad_output_is_refused_before_the_flight(
 
 
 def _first_weight(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict, dict], None]:
-    def damage(arrays: dict[str, np.ndarray], card: dict[str, Any]) -> None:
+    def damage(arrays: dict[str, np.ndarray], metadata: dict[str, Any]) -> None:
         arrays["weight_0"] = change(arrays["weight_0"])
 
     return damage
 
 
-def _in_card(key: str, change: Callable[[Any], Any]) -> Callable[[dict, dict], None]:
-    def damage(arrays: dict[str, np.ndarray], card: dict[str, Any]) -> None:
-        card[key] = change(card[key])
+def _in_metadata(key: str, change: Callable[[Any], Any]) -> Callable[[dict, dict], None]:
+    def damage(arrays: dict[str, np.ndarray], metadata: dict[str, Any]) -> None:
+        metadata[key] = change(metadata[key])
 
     return damage
 
@@ -107,27 +107,27 @@ DAMAGES: dict[str, tuple[Callable[[dict, dict], None], str]] = {
     "wrong rank": (_first_weight(np.ravel), "shape"),
     "wrong dtype": (_first_weight(lambda weight: weight.astype(np.float64)), "float32"),
     "NaN": (_first_weight(_with_nan), "finite"),
-    "array missing": (lambda arrays, card: arrays.pop("bias_1"), "bias_1"),
-    "array too many": (lambda arrays, card: arrays.update(extra=np.zeros(3)), "extra"),
-    "layer missing": (lambda arrays, card: [arrays.pop(name) for name in ("weight_2", "bias_2")], "shape"),
-    "statistics missing": (lambda arrays, card: arrays.pop("observation_mean"), "observation_mean"),
-    "statistics infinite": (lambda arrays, card: arrays["observation_mean"].fill(np.inf), "finite"),
-    "negative scale": (lambda arrays, card: arrays["action_scale"].fill(-1), "positive"),
-    "pickle inside": (lambda arrays, card: arrays.update(weight_0=np.array([{}], object)), "pickle"),
-    "later format": (_in_card("format_version", lambda version: version + 1), "format"),
-    "format is text": (_in_card("format_version", str), "format"),
-    "card field missing": (lambda arrays, card: card.pop("control_period"), "control_period"),
-    "another observation": (_in_card("observation", lambda slots: [["battery", "V"], *slots[1:]]), "observation"),
-    "another order": (_in_card("observation", lambda slots: slots[::-1]), "observation"),
-    "another unit": (_in_card("observation", lambda slots: [[name, "deg"] for name, _ in slots]), "observation"),
-    "another slot": (_in_card("observation", lambda slots: [*slots, "battery"]), "observation"),
-    "fewer observations": (_in_card("observation", lambda slots: slots[:-1]), "observation"),
-    "another action": (_in_card("action", lambda slots: slots[::-1]), "action"),
-    "longer history": (_in_card("history", lambda _: 2), "history"),
-    "another rate": (_in_card("control_period", lambda _: 0.01), "control period"),
-    "another plant": (_in_card("plant", lambda plant: {**plant, "arm": 0.2}), "plant"),
-    "number beyond any float": (_in_card("gravity", lambda _: 10**400), "gravity"),
-    "bounds not numbers": (_in_card("bounds", lambda _: {"x_peak": "small"}), "bounds"),
+    "array missing": (lambda arrays, metadata: arrays.pop("bias_1"), "bias_1"),
+    "array too many": (lambda arrays, metadata: arrays.update(extra=np.zeros(3)), "extra"),
+    "layer missing": (lambda arrays, metadata: [arrays.pop(name) for name in ("weight_2", "bias_2")], "shape"),
+    "statistics missing": (lambda arrays, metadata: arrays.pop("observation_mean"), "observation_mean"),
+    "statistics infinite": (lambda arrays, metadata: arrays["observation_mean"].fill(np.inf), "finite"),
+    "negative scale": (lambda arrays, metadata: arrays["action_scale"].fill(-1), "positive"),
+    "pickle inside": (lambda arrays, metadata: arrays.update(weight_0=np.array([{}], object)), "pickle"),
+    "later format": (_in_metadata("format_version", lambda version: version + 1), "format"),
+    "format is text": (_in_metadata("format_version", str), "format"),
+    "card field missing": (lambda arrays, metadata: metadata.pop("control_period"), "control_period"),
+    "another observation": (_in_metadata("observation", lambda slots: [["battery", "V"], *slots[1:]]), "observation"),
+    "another order": (_in_metadata("observation", lambda slots: slots[::-1]), "observation"),
+    "another unit": (_in_metadata("observation", lambda slots: [[name, "deg"] for name, _ in slots]), "observation"),
+    "another slot": (_in_metadata("observation", lambda slots: [*slots, "battery"]), "observation"),
+    "fewer observations": (_in_metadata("observation", lambda slots: slots[:-1]), "observation"),
+    "another action": (_in_metadata("action", lambda slots: slots[::-1]), "action"),
+    "longer history": (_in_metadata("history", lambda _: 2), "history"),
+    "another rate": (_in_metadata("control_period", lambda _: 0.01), "control period"),
+    "another plant": (_in_metadata("plant", lambda plant: {**plant, "arm": 0.2}), "plant"),
+    "number beyond any float": (_in_metadata("gravity", lambda _: 10**400), "gravity"),
+    "bounds not numbers": (_in_metadata("bounds", lambda _: {"x_peak": "small"}), "bounds"),
 }
 
 
@@ -135,9 +135,9 @@ DAMAGES: dict[str, tuple[Callable[[dict, dict], None], str]] = {
 def test_unusable_policy_is_named_and_refused(
     here: Path, damage: Callable[[dict, dict], None], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arrays, card = load_arrays()
-    damage(arrays, card)
-    write_arrays(here / "odd.npz", arrays, card)
+    arrays, metadata = load_arrays()
+    damage(arrays, metadata)
+    write_arrays(here / "odd.npz", arrays, metadata)
     message = refused(here, [*FAST, "odd.npz", "--json", "new.json", "--out", "new"], capsys)
     assert "odd.npz" in message
     assert word in message
@@ -162,7 +162,7 @@ def test_damaged_bytes_are_refused(
 
 def test_card_that_is_not_json_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arrays, _ = load_arrays()
-    np.savez(here / "odd.npz", **arrays, card=np.array("{"))
+    np.savez(here / "odd.npz", **arrays | {"card": np.array("{")})
     assert "card" in refused(here, [*FAST, "odd.npz"], capsys)
 
 

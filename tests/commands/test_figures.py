@@ -17,7 +17,7 @@ from mjxball.commands.evaluate import main
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.evaluate import stand_figure
-from mjxball.evaluate.paper_figures import NAMES, draw_reward, read_curve, swings
+from mjxball.evaluate.paper_figures import NAMES, plot_reward, read_curve, swings
 from mjxball.evaluate.results import fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.policy import Policy
@@ -33,10 +33,10 @@ CURVE = {
 }
 
 
-def policy_with(**card: Any) -> Policy:
+def policy_with(**metadata: Any) -> Policy:
     """The shipped follower with another card, under the name `mine`."""
     policy = Policy.load(TRANSPORT)
-    policy.name, policy.card = "mine", {**policy.card, **card}
+    policy.name, policy.metadata = "mine", {**policy.metadata, **metadata}
     return policy
 
 
@@ -78,16 +78,16 @@ def test_unsound_training_curve_is_refused(curve: Any) -> None:
 
 def standing(path: Path, **plant: Any) -> Path:
     """The shipped follower for the stand under another name."""
-    arrays, card = load_arrays(shipped_policy("stand"))
-    return write_arrays(path, arrays, {**card, "seeds": 4, "plant": {**card["plant"], **plant}})
+    arrays, metadata = load_arrays(shipped_policy("stand"))
+    return write_arrays(path, arrays, {**metadata, "seeds": 4, "plant": {**metadata["plant"], **plant}})
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """All figures of the shipped follower with a training curve, and of one that claims to be made for a stand."""
     here = tmp_path_factory.mktemp("figures")
-    arrays, card = load_arrays()
-    write_arrays(here / "curved.npz", arrays, {**card, "curve": CURVE})
+    arrays, metadata = load_arrays()
+    write_arrays(here / "curved.npz", arrays, {**metadata, "curve": CURVE})
     flags = [here / "curved.npz", standing(here / "rocked.npz"), "--out", here / "out"]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(stand_figure, "STAND_START", dataclasses.replace(stand_figure.STAND_START, seconds=22.0))
@@ -128,7 +128,7 @@ def test_reward_table_has_a_row_for_every_policy() -> None:
     mimic = policy_with(curve=CURVE, config={"reward": {"kind": "paper"}})
     bare = policy_with(curve=None)
     bare.name = "bare"
-    rows = draw_reward([mimic, bare]).rows
+    rows = plot_reward([mimic, bare]).rows
     assert rows[0] == ("mine", "paper", "300", "-900", "-50", "-20")
     assert rows[1][:2] == ("bare", "no training curve in its card")
 
@@ -175,10 +175,10 @@ REFUSED = {
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working directory that holds what bad inputs point at."""
-    arrays, card = load_arrays()
-    write_arrays(tmp_path / "thin.npz", arrays, {**card, "plant": {**card["plant"], "arm": 0.1}})
-    write_arrays(tmp_path / "odd.npz", arrays, {**card, "curve": {"steps": 3}})
-    write_arrays(tmp_path / "copy.npz", arrays, card)
+    arrays, metadata = load_arrays()
+    write_arrays(tmp_path / "thin.npz", arrays, {**metadata, "plant": {**metadata["plant"], "arm": 0.1}})
+    write_arrays(tmp_path / "odd.npz", arrays, {**metadata, "curve": {"steps": 3}})
+    write_arrays(tmp_path / "copy.npz", arrays, metadata)
     standing(tmp_path / "heave.npz")
     standing(tmp_path / "wide.npz", arm=0.1)
     (tmp_path / "full").mkdir()
@@ -188,8 +188,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_figures_of_a_paper_are_pdf_of_a_columns_width(tmp_path: Path) -> None:
-    arrays, card = load_arrays()
-    write_arrays(tmp_path / "curved.npz", arrays, {**card, "curve": CURVE})
+    arrays, metadata = load_arrays()
+    write_arrays(tmp_path / "curved.npz", arrays, {**metadata, "curve": CURVE})
     out = tmp_path / "out"
     assert call(main, ["figures", tmp_path / "curved.npz", "--only", "reward", "--style", "paper", "--out", out]) == 0
     assert {path.name for path in out.iterdir()} == {"figures.html", "figure-reward.pdf"}

@@ -88,10 +88,10 @@ def test_run_records_what_made_it(finished: Path) -> None:
     assert config.sac.total_steps == STEPS
     assert config.sac.policy_layers == (16, 16)
     assert (record["seed"], record["physics"]) == (3, "newton-euler")
-    _, card = load_arrays(finished / "policy.npz")
-    assert card["config_hash"] == record["config_hash"]
-    assert card["training_steps"] == STEPS
-    assert card["preset"] == "transport"
+    _, metadata = load_arrays(finished / "policy.npz")
+    assert metadata["config_hash"] == record["config_hash"]
+    assert metadata["training_steps"] == STEPS
+    assert metadata["preset"] == "transport"
 
 
 @pytest.mark.slow

@@ -343,7 +343,7 @@ def test_a_record_of_a_version_that_had_other_settings_is_refused(section: str, 
 
 @rows("path", sorted(Path(__file__).parents[2].glob("policies/**/*.npz")))
 def test_the_card_of_every_shipped_policy(path: Path) -> None:
-    card = load_file(path).card
-    config = configs.validate(configs.from_record(card["config"]))
-    assert (configs.config_hash(card["config"]), config.preset) == (card["config_hash"], card["preset"])
-    assert configs.from_record({"plant": card["plant"]}).plant == config.plant
+    metadata = load_file(path).metadata
+    config = configs.validate(configs.from_record(metadata["config"]))
+    assert (configs.config_hash(metadata["config"]), config.preset) == (metadata["config_hash"], metadata["preset"])
+    assert configs.from_record({"plant": metadata["plant"]}).plant == config.plant

@@ -19,7 +19,7 @@ from mjxball.config import Config, Drone, Plant, preset, validate, with_plant
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import group_by_plant
-from mjxball.evaluate.scenarios import REFERENCE, rig_line, standard_scenarios
+from mjxball.evaluate.scenarios import REFERENCE, rig_summary, standard_scenarios
 from mjxball.plant.trim import heaviest_object, largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxball.sim.rollout import simulate
@@ -78,7 +78,7 @@ def test_every_command_flies_the_object_of_the_plant(tmp_path: Path, capsys: pyt
     assert evaluate.main([*asked, "--json", str(out)]) == 0
     assert [cell["mass"] for cell in json.loads(out.read_text())["cells"]] == [0.35]
     first = capsys.readouterr().out.splitlines()[0]
-    assert first == rig_line(rig)
+    assert first == rig_summary(rig)
     held = heaviest_object(rig, 0.05)
     assert f"can hover objects of up to {held:.3g} kg, 0.05 m off" in first
     assert largest_margin(rig, held, 0.05).margin == pytest.approx(rig.scenario.trim_margin, abs=5e-3)
@@ -137,7 +137,8 @@ def test_a_policy_of_a_rig_of_its_own_flies_that_rig(tmp_path: Path) -> None:
     rig = with_plant(preset("balance"), written(tmp_path, HEAVY))
     settings = configs.to_dict(rig)
     save_file(
-        path, dataclasses.replace(contents, card={**contents.card, "plant": settings["plant"], "config": settings})
+        path,
+        dataclasses.replace(contents, metadata={**contents.metadata, "plant": settings["plant"], "config": settings}),
     )
     paper, ((own, files),) = group_by_plant([path, shipped_policy("balance")])
     assert (own.plant.object_mass, files, paper) == (0.35, [path], [shipped_policy("balance")])

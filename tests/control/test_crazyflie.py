@@ -32,15 +32,15 @@ def alone(**gains: tuple[float, float, float]) -> Autopilot:
     return dataclasses.replace(STOCK, **none | gains)
 
 
-def tick(law: Autopilot, setpoint=HOVER, euler=LEVEL, rates=STILL, loops=None):
+def tick(controller: Autopilot, setpoint=HOVER, euler=LEVEL, rates=STILL, loops=None):
     started = crazyflie.start_loops(LEVEL, STILL) if loops is None else loops
-    return crazyflie.cascade(law, started, np.asarray(setpoint, float), np.asarray(euler), np.asarray(rates))
+    return crazyflie.cascade(controller, started, np.asarray(setpoint, float), np.asarray(euler), np.asarray(rates))
 
 
-def after(law: Autopilot, ticks: int, **held):
+def after(controller: Autopilot, ticks: int, **held):
     loops = crazyflie.start_loops(LEVEL, STILL)
     for _ in range(ticks):
-        loops, motors = tick(law, loops=loops, **held)
+        loops, motors = tick(controller, loops=loops, **held)
     return crazyflie.unpack(loops), motors
 
 
@@ -78,10 +78,10 @@ class TestLoops:
 
     def test_derivative_is_of_the_measurement(self) -> None:
         """A step of the command does not kick; a step of the angle does, against it."""
-        law = alone(roll=(0, 0, 1), roll_rate=(100, 0, 0))
-        _, motors = tick(law, (10.0, 0.0, 0.0, 4e4))
+        controller = alone(roll=(0, 0, 1), roll_rate=(100, 0, 0))
+        _, motors = tick(controller, (10.0, 0.0, 0.0, 4e4))
         np.testing.assert_array_equal(motors, 4e4)
-        _, motors = tick(law, euler=np.radians([0.1, 0, 0]))
+        _, motors = tick(controller, euler=np.radians([0.1, 0, 0]))
         assert outputs(motors)[0] == math.trunc(-100 * 0.1 / 0.002 / 2)
 
     def test_yaw_rate_turns_the_yaw_to_hold_the_other_way(self) -> None:
@@ -173,20 +173,22 @@ class TestMotors:
 
 
 class TestSent:
-    @pytest.mark.parametrize("law", ["calibrated", "paper"])
+    @pytest.mark.parametrize("controller", ["calibrated", "paper"])
     @pytest.mark.parametrize("curve", [OLDER, LINEAR], ids=["older", "2026.04"])
     @given(
         st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-8, 8)),
         st.floats(0.03, 0.045),
     )
-    def test_simulation_and_flight_send_the_same_numbers(self, law: str, curve, command, mass: float) -> None:
-        config = dataclasses.replace(STOCK, thrust_law=law, motor_curve=curve)
+    def test_simulation_and_flight_send_the_same_numbers(self, controller: str, curve, command, mass: float) -> None:
+        config = dataclasses.replace(STOCK, thrust_law=controller, motor_curve=curve)
         simulated = crazyflie.setpoints(config, np.array(command), np.array(mass), 9.81)
-        free = CommandMap(law, carried_mass=mass, curve=ForceCurve(*curve))
+        free = CommandMap(controller, carried_mass=mass, curve=ForceCurve(*curve))
         flown = to_setpoint(np.array(command), free).setpoint
         # float32 on the wire: 1e-7 of 15 degrees. A thrust half way between two units may round either way.
         np.testing.assert_allclose(simulated[:3], packets.unpack_setpoint(packets.pack_setpoint(flown))[:3], atol=2e-6)
-        assert abs(simulated[3] - flown.thrust) <= (0 if law == "paper" and command[2] == round(command[2]) else 1)
+        assert abs(simulated[3] - flown.thrust) <= (
+            0 if controller == "paper" and command[2] == round(command[2]) else 1
+        )
         assert simulated[3] == round(simulated[3])
         assert packets.THRUST_FLOOR <= simulated[3] <= packets.THRUST_CEILING
 
@@ -251,13 +253,13 @@ class TestRefused:
 
 def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
     jax = pytest.importorskip("jax")
-    jnp, law = jax.numpy, crazyflie.STOCK
+    jnp, controller = jax.numpy, crazyflie.STOCK
     draw = np.random.default_rng(0).normal(size=(400, 3)) * [0.1, 0.1, 2.0]
 
     @jax.jit
     def sent(command: Any) -> Any:
         mass = jnp.full(command.shape[:-1], 0.0377, jnp.float32)
-        return crazyflie.setpoints(law, jnp.asarray(command, jnp.float32), mass, 9.81)
+        return crazyflie.setpoints(controller, jnp.asarray(command, jnp.float32), mass, 9.81)
 
     thrust = np.asarray(sent(draw))[:, 3]
     assert (thrust == np.round(thrust)).all()

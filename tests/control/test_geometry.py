@@ -23,7 +23,7 @@ from mjxball.policy.container import PolicyFileError
 from mjxball.policy.export import policy_file
 from mjxball.policy.file import save_file
 from mjxball.policy.inference import geometry_of
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 
 TEAM = preset("team")
 ENGINE = "newton-euler"
@@ -65,14 +65,14 @@ def test_worlds_of_training_are_told_what_a_flight_is_told() -> None:
 
 def silent(config: Config) -> PolicyFile:
     """A network of zeros."""
-    law, units = follower_law(config), config.follower.recurrent_units
-    size = law.input_size
+    controller, units = follower_controller(config), config.follower.recurrent_units
+    size = controller.input_size
     shapes = {"hidden_0": (size + units, 8), "hidden_1": (8 + units, 6)}
     layers = {name: {"kernel": np.zeros(shape), "bias": np.zeros(shape[1])} for name, shape in shapes.items()}
     gates = 3 * units
     gru = {"kernel": np.zeros((size, gates)), "recurrent": np.zeros((units, gates)), "bias": np.zeros(gates)}
     learnt = PolicyNetwork({**layers, "gru": gru}, np.zeros(size), np.ones(size), np.ones(size))
-    return policy_file(config, law, learnt, steps=0)
+    return policy_file(config, controller, learnt, steps=0)
 
 
 @pytest.fixture(scope="module")
@@ -106,4 +106,4 @@ def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file) -> None:
 def test_unsound_files_are_refused(given: dict, said: str, tmp_path) -> None:
     contents = silent(TEAM)
     with pytest.raises(PolicyFileError, match=said):
-        save_file(tmp_path / "unsound.npz", dataclasses.replace(contents, card=contents.card | given))
+        save_file(tmp_path / "unsound.npz", dataclasses.replace(contents, metadata=contents.metadata | given))

@@ -5,7 +5,7 @@ from euler_angles import matrix_from_euler
 
 from mjxball.control import observation as layout
 from mjxball.control import rotations
-from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.follower_controller import FollowerController
 
 MOUNT = np.array([-0.17, 0.0, 0.0])
 
@@ -74,12 +74,12 @@ def seen_with(error, rate):
 
 
 HISTORY = layout.ObservationHistory()
-LAW = {"kp": (0.5, 0.5, 0.5), "kd": (1.0, 1.0, 1.0), "gravity": 10.0, "limits": (0.6, 6.0)}
+CONTROLLER = {"kp": (0.5, 0.5, 0.5), "kd": (1.0, 1.0, 1.0), "gravity": 10.0, "limits": (0.6, 6.0)}
 
 
 def test_copy_is_the_pd_law_on_the_observed_error():
     seen = seen_with([1.0, 2.0, 3.0], [0.5, 0.0, -1.0])
-    command = layout.copy_command(seen, LAW["kp"], LAW["kd"], 10.0, 0.6, 6.0)
+    command = layout.copy_command(seen, CONTROLLER["kp"], CONTROLLER["kd"], 10.0, 0.6, 6.0)
     np.testing.assert_allclose(command, [-0.1, 0.1, 0.5], rtol=1e-15)
 
 
@@ -87,7 +87,7 @@ def test_residual_adds_to_the_pd_law_and_direct_does_not():
     seen, scaled = seen_with([1.0, 0, 0], [0, 0, 0]), np.array([0.5, -1.0, 0.25])
     reach = (0.2, 2.0)
     direct, residual = (
-        FollowerLaw(HISTORY, reach, residual=adds, **LAW).command(scaled, seen) for adds in (False, True)
+        FollowerController(HISTORY, reach, residual=adds, **CONTROLLER).command(scaled, seen) for adds in (False, True)
     )
     np.testing.assert_allclose(direct, [0.1, -0.2, 0.5], rtol=1e-15)
     np.testing.assert_allclose(residual, [0.1, -0.2 + 0.05, 0.5], rtol=1e-14)
@@ -96,9 +96,9 @@ def test_residual_adds_to_the_pd_law_and_direct_does_not():
 def test_command_never_leaves_the_shared_limits():
     seen = seen_with([100.0, -100.0, 100.0], [0, 0, 0])
     for scaled in (np.ones(3), -np.ones(3)):
-        command = FollowerLaw(HISTORY, (0.2, 2.0), **LAW).command(scaled, seen)
+        command = FollowerController(HISTORY, (0.2, 2.0), **CONTROLLER).command(scaled, seen)
         assert (np.abs(command) <= [0.6, 0.6, 6.0]).all()
-    wide = FollowerLaw(HISTORY, (1.0, 20.0), residual=False, **LAW).command(np.ones(3), seen)
+    wide = FollowerController(HISTORY, (1.0, 20.0), residual=False, **CONTROLLER).command(np.ones(3), seen)
     np.testing.assert_array_equal(wide, [0.6, 0.6, 6.0])
 
 

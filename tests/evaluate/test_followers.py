@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.config import preset
 from mjxball.errors import InputError
-from mjxball.evaluate.followers import find_follower
+from mjxball.evaluate.followers import follower_factory
 
 SOURCE = """
 import numpy as np
@@ -34,7 +34,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_it_writes_to_its_observation_stays_with_it(own: None) -> None:
-    follower = find_follower("own_followers:Writes", "--followers")[1](preset("transport"))
+    follower = follower_factory("own_followers:Writes", "--followers")[1](preset("transport"))
     observation = np.linspace(0.0, 1.0, 36).reshape(2, 18)
     kept = observation.copy()
     assert follower(observation).shape == (2, 3)
@@ -42,7 +42,7 @@ def test_what_it_writes_to_its_observation_stays_with_it(own: None) -> None:
 
 
 def test_what_it_raises_has_a_line_and_a_shape(own: None) -> None:
-    follower = find_follower("own_followers:Natural", "--followers")[1](preset("transport"))
+    follower = follower_factory("own_followers:Natural", "--followers")[1](preset("transport"))
     said = r"IndexError: .*, in own_followers.py line 13, given observations of shape \(2, 18\)"
     with pytest.raises(InputError, match=said):
         follower(np.zeros((2, 18)))

@@ -42,7 +42,7 @@ def test_a_figure_has_a_line_for_each_follower_and_coordinate(
         drawn.extend([line.get_ydata() for line in panel.lines] for panel in figure.axes)
 
     monkeypatch.setattr(plt, "close", keep)
-    plots.draw_flights(flown, "title", tmp_path / "figure.png")
+    plots.plot_flights(flown, "title", tmp_path / "figure.png")
     monkeypatch.undo()
     plt.close("all")
     kinds = [kind for kind, _, _ in plots.PANELS]

@@ -15,8 +15,8 @@ from mjxfly.limits import FlightSettings, Times
 from mjxfly.packets import THRUST_CEILING
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.twin.conditions import FAULT_KINDS
-from mjxfly.twin.virtual import MemoryLog
-from mjxfly.twin.virtual import VirtualTwin as CoupledTwin
+from virtual_twin import MemoryLog
+from virtual_twin import VirtualTwin as CoupledTwin
 
 
 def silence_down(world: VirtualTwin, number: int) -> None:

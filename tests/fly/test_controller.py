@@ -15,10 +15,10 @@ from wire import pack_state
 from mjxball.control import observation, rotations
 from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.sim.laws import Laws
+from mjxball.sim.controllers import Controllers
 from mjxfly import process
-from mjxfly.card import Controller, config_of
 from mjxfly.packets import DroneState, unpack_state
+from mjxfly.policy_setup import FlightController, config_of
 from mjxfly.process import Metronome
 from mjxfly.telemetry import Rig, object_state
 
@@ -54,15 +54,15 @@ def test_the_objects_state_is_found_from_both_drones(
 
 def with_integral(contents: PolicyFile) -> PolicyFile:
     """The same policy under a leader with an integral gain, as on the paper's stand."""
-    config = {**contents.card["config"], "leader": {**contents.card["config"]["leader"], "ki": [0.2, 0.1, 0.1]}}
-    return dataclasses.replace(contents, card={**contents.card, "config": config})
+    config = {**contents.metadata["config"], "leader": {**contents.metadata["config"]["leader"], "ki": [0.2, 0.1, 0.1]}}
+    return dataclasses.replace(contents, metadata={**contents.metadata, "config": config})
 
 
 def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
     contents = with_integral(load_file(TRANSPORT))
-    config = config_of(contents.card)
+    config = config_of(contents.metadata)
     assert config.leader.ki == (0.2, 0.1, 0.1)
-    controller, follower = Controller(Policy(contents, "a")), Policy(contents, "b")
+    controller, follower = FlightController(Policy(contents, "a")), Policy(contents, "b")
     random, goal, integral = np.random.default_rng(2), np.array([0.3, -0.2, 0.5]), np.zeros(3)
     mount = np.array(config.plant.pair[1].mount)
     follower.reset()
@@ -75,13 +75,15 @@ def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
         np.testing.assert_allclose(flown.observation, seen, atol=1e-12)
         zero = np.zeros(())
         simulated = PlantState(*(zero for _ in PlantState._fields))._replace(position=position, velocity=velocity)
-        np.testing.assert_allclose(flown.leader, Laws(config).leader_command(simulated, goal, integral), atol=1e-10)
+        np.testing.assert_allclose(
+            flown.leader, Controllers(config).leader_command(simulated, goal, integral), atol=1e-10
+        )
         np.testing.assert_allclose(flown.follower, follower(seen), atol=1e-5)  # float32 inference
         integral = integral + config.timing.control_period * (goal - position)
 
 
 def pilot_rig(contents: PolicyFile) -> Rig:
-    return Rig.of_card(contents.card)
+    return Rig.from_metadata(contents.metadata)
 
 
 def test_the_wire_costs_little_of_the_observation() -> None:
@@ -103,7 +105,7 @@ def test_the_wire_costs_little_of_the_observation() -> None:
 
 def test_forgetting_starts_anew() -> None:
     contents = load_file(TRANSPORT)
-    controller, rig = Controller(Policy(contents, "a")), pilot_rig(contents)
+    controller, rig = FlightController(Policy(contents, "a")), pilot_rig(contents)
     state = object_state(drones(rig, *np.full((4, 3), 0.1)), rig)
     first = controller.step(state, np.ones(3))
     controller.step(state, np.zeros(3))

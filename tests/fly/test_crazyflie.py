@@ -15,11 +15,11 @@ from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
-from mjxfly import card
+from mjxfly import policy_setup
 from mjxfly.limits import FlightSettings
 from mjxfly.setpoints import ForceCurve, to_setpoint
 from mjxfly.supervisor import FlightState
-from mjxfly.twin.physics import StandIn, make_pair
+from mjxfly.twin.physics import SimplePair, make_pair
 
 PRESETS = ("flight", "stand")
 vertical = st.floats(-4, 4)
@@ -28,9 +28,9 @@ tilt = st.floats(-0.5, 0.5)
 
 def world_of(preset: str, seconds: float) -> VirtualTwin:
     contents = untrained(preset)
-    config = card.config_of(contents.card)
-    settings = FlightSettings(seconds=seconds, goal=card.goal_of(config))
-    return VirtualTwin(settings, contents=contents, physics=make_pair(contents.card))
+    config = policy_setup.config_of(contents.metadata)
+    settings = FlightSettings(seconds=seconds, goal=policy_setup.goal_of(config))
+    return VirtualTwin(settings, contents=contents, physics=make_pair(contents.metadata))
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def test_the_papers_stand_lifts_off_rolls_and_comes_down() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_leader_flies_the_cards_law(preset: str) -> None:
-    config = card.config_of(untrained(preset).card)
+    config = policy_setup.config_of(untrained(preset).metadata)
     assert config == configs.preset(preset)
     world = world_of(preset, 2.0)
     world.fly_until(FlightState.FLY)
@@ -103,7 +103,7 @@ def test_what_is_sent_is_what_was_simulated(preset: str, roll: float, pitch: flo
     carried = constants.drone_mass + constants.load_share * config.plant.object_mass
     command = np.array([[roll, pitch, lift]] * 2)
     expected = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)
-    for row, known in zip(expected, card.command_maps(config), strict=True):
+    for row, known in zip(expected, policy_setup.command_maps(config), strict=True):
         sent = to_setpoint(command[0], known).setpoint
         np.testing.assert_allclose(sent[:3], row[:3], atol=1e-9)
         assert abs(sent.thrust - row[3]) <= 1  # a cut of tilt comes before the thrust there as here; rounding
@@ -111,21 +111,21 @@ def test_what_is_sent_is_what_was_simulated(preset: str, roll: float, pitch: flo
 
 def test_flags_overrule_the_card() -> None:
     config = configs.preset("stand")
-    leader, _ = card.command_maps(config)
-    assert (leader.law, leader.hover, leader.curve) == ("paper", 50568.0, ForceCurve(0.0, 0.12))
+    leader, _ = policy_setup.command_maps(config)
+    assert (leader.thrust_model, leader.hover, leader.curve) == ("paper", 50568.0, ForceCurve(0.0, 0.12))
     assert leader.carried_mass == pytest.approx(0.0755 / 2)
-    leader, follower = card.command_maps(config, card.ThrustChoice("calibrated", 45000.0, None, 0.08))
-    assert (leader.law, leader.hover, leader.curve) == ("calibrated", 45000.0, ForceCurve(0.0, 0.12))
+    leader, follower = policy_setup.command_maps(config, policy_setup.ThrustOptions("calibrated", 45000.0, None, 0.08))
+    assert (leader.thrust_model, leader.hover, leader.curve) == ("calibrated", 45000.0, ForceCurve(0.0, 0.12))
     assert leader.carried_mass + follower.carried_mass == pytest.approx(0.08)
 
 
 def test_policies_of_other_plants_keep_their_defaults() -> None:
     contents = load_file(shipped_policy("transport"))
-    config = card.config_of(contents.card)
-    assert not card.is_crazyflie(config)
-    assert card.gains_of(config) == ({}, {})
-    assert card.command_maps(config)[0].carried_mass == pytest.approx(card.UNKNOWN_MASS / 2)
-    assert isinstance(make_pair(contents.card), StandIn)
-    broken = {**contents.card, "config": {**contents.card["config"], "autopilot": {"kind": "magic"}}}
+    config = policy_setup.config_of(contents.metadata)
+    assert not policy_setup.is_crazyflie(config)
+    assert policy_setup.gains_of(config) == ({}, {})
+    assert policy_setup.command_maps(config)[0].carried_mass == pytest.approx(policy_setup.UNKNOWN_MASS / 2)
+    assert isinstance(make_pair(contents.metadata), SimplePair)
+    broken = {**contents.metadata, "config": {**contents.metadata["config"], "autopilot": {"kind": "magic"}}}
     with pytest.raises(InputError):
-        card.config_of(broken)
+        policy_setup.config_of(broken)

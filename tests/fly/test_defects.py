@@ -12,20 +12,20 @@ from tables import weekly
 from mjxball.control.rotations import roll_of_quaternion
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from mjxfly.card import Controller, goal_of, times_of
 from mjxfly.limits import FlightSettings, Limits
 from mjxfly.packets import FLYING, LOCKED
+from mjxfly.policy_setup import FlightController, goal_of, times_of
 from mjxfly.preflight import curve_of_version
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
-from mjxfly.twin.virtual import MemoryLog, VirtualTwin
+from virtual_twin import MemoryLog, VirtualTwin
 
 pytest.importorskip("mujoco")
 
 
 def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, **surroundings) -> VirtualTwin:
     policy = Policy.load(shipped_policy(name))
-    config = Controller(policy).config
+    config = FlightController(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
     limits = Limits().on_stand(goal[2]) if stand else Limits()
     settings = FlightSettings(seconds, goal, stand=stand, limits=limits, times=times_of(config))
@@ -133,7 +133,7 @@ def test_a_pair_too_heavy_for_its_firmware_is_refused_before_the_ramp() -> None:
 def test_the_stand_keeps_its_ball_under_the_estimators_sideways_motion() -> None:
     """Defect 5: fed sideways positions that do not exist, both laws lost the ball from 4 cm."""
     policy = Policy.load(shipped_policy("stand"))
-    conditions = dataclasses.replace(Conditions.of(Controller(policy).config), ball=0.03)
+    conditions = dataclasses.replace(Conditions.of(FlightController(policy).config), ball=0.03)
     world = world_of("stand", 15.0, conditions=conditions)
     world.run(60.0)
     assert world.flight.supervisor.cause is None

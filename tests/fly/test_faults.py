@@ -14,14 +14,14 @@ from mjxball.control import motors
 from mjxball.control.motors import MOTORS
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
-from mjxfly.card import command_maps, config_of
 from mjxfly.lift import ALL, LiftWatch
 from mjxfly.limits import FlightSettings
+from mjxfly.policy_setup import command_maps, config_of
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import ObjectState, Rig
 from mjxfly.twin.conditions import FAULT_KINDS, Surroundings
-from mjxfly.twin.virtual import MemoryLog, Moment, VirtualTwin
+from virtual_twin import MemoryLog, TrueState, VirtualTwin
 
 FLIGHT = shipped_policy("flight")
 HEIGHT = 0.4  # [m] of the hover
@@ -38,7 +38,7 @@ def hovering(seconds: float = 20.0, height: float = HEIGHT, flown: float = 3.0) 
     return world
 
 
-def after(world: VirtualTwin, kind: str, *drones: int) -> list[Moment]:
+def after(world: VirtualTwin, kind: str, *drones: int) -> list[TrueState]:
     """What came of a fault `kind` of some drones, until all is off."""
     for drone in drones:
         world.drones[drone].inject(FAULT_KINDS[kind].what)
@@ -48,7 +48,7 @@ def after(world: VirtualTwin, kind: str, *drones: int) -> list[Moment]:
     return world.track[begin:]
 
 
-def cut(track: list[Moment]) -> Moment:
+def cut(track: list[TrueState]) -> TrueState:
     """The first moment at which no motor turns."""
     return next(moment for moment in track if moment.pwm.max() == 0)
 
@@ -163,7 +163,7 @@ def test_an_uplink_that_comes_back_is_flown_through() -> None:
 @functools.cache
 def carried() -> CommandMap:
     """What a drone of `flight` lifts."""
-    return command_maps(config_of(load_file(FLIGHT).card))[0]
+    return command_maps(config_of(load_file(FLIGHT).metadata))[0]
 
 
 def lift(voltage: float) -> float:
@@ -231,7 +231,7 @@ BATTERIES = [
 
 @rows("voltage, spare", BATTERIES)
 def test_lift_is_in_danger_where_the_voltage_says_so(voltage, spare: float | None) -> None:
-    maps = command_maps(config_of(load_file(FLIGHT).card))
+    maps = command_maps(config_of(load_file(FLIGHT).metadata))
     watch, found = LiftWatch(MOTORS["2.1"]), []
     for number in range(200):
         now = 0.01 * number
@@ -249,7 +249,7 @@ def test_lift_is_in_danger_where_the_voltage_says_so(voltage, spare: float | Non
 def test_a_pair_without_lift_that_climbs_has_lift() -> None:
     watch = LiftWatch(MOTORS["2.1"])
     rig = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
-    maps = command_maps(config_of(load_file(FLIGHT).card))
+    maps = command_maps(config_of(load_file(FLIGHT).metadata))
     for number in range(5):
         watch.update([2.6, 2.6], maps, HEIGHT, 0.4, 0.01 * number)
     seen = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))

@@ -18,7 +18,7 @@ from mjxfly import packets, session
 from mjxfly.limits import FlightSettings, Times
 from mjxfly.setpoints import LastKnownState, Variant
 from mjxfly.supervisor import AIRBORNE, Event, Fault, FlightState, Supervisor
-from mjxfly.watchdog import PERIOD, way_down
+from mjxfly.watchdog import PERIOD, descent_packets
 
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
 
@@ -213,7 +213,7 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
         assert (left.value.args, guard.left, saved) == ((1,), True, [True])
         assert "RuntimeError: a bug" in capsys.readouterr().err
         assert [len(link.packets) for link in world.links] == before  # not a word to the drones
-        for packets_of_both in zip(*(way_down(number, seen, 0.0) for number in range(2)), strict=True):
+        for packets_of_both in zip(*(descent_packets(number, seen, 0.0) for number in range(2)), strict=True):
             for link, packet in zip(world.links, packets_of_both, strict=True):
                 link.send(packet)
             world.advance(PERIOD)
@@ -234,7 +234,7 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
 
 def test_a_log_that_is_not_written_keeps_the_pair_on_the_ground(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(session, "check", lambda *_: [])
-    nobody = SimpleNamespace(mocap=None, apps=None, excuse=lambda: None, rig=None, preflight=None)
+    nobody = SimpleNamespace(mocap=None, apps=None, rehearsal_error=lambda: None, rig=None, preflight=None)
     for failure in (None, "No space left on device"):
         journal = SimpleNamespace(failure=failure, note=lambda *_, **fields: None)
         assert session._checked([], nobody, FlightSettings(), journal) is (failure is None)

@@ -20,7 +20,7 @@ from mjxfly.twin import logs
 from mjxfly.twin.conditions import DroneFaults
 from mjxfly.twin.drone import garbage
 from mjxfly.twin.firmware import BOOT_TIME, Firmware
-from mjxfly.twin.physics import StandIn
+from mjxfly.twin.physics import SimplePair
 from mjxfly.twin.protocol import MAX_DATA, Peer
 from mjxfly.twin.server import HOST, Twin
 
@@ -95,7 +95,7 @@ def opened(twin: Twin) -> Link:
 @pytest.mark.clock
 def test_cflib_still_connects_after_a_storm() -> None:
     random = np.random.default_rng(5)
-    with Twin(StandIn()) as twin:
+    with Twin(SimplePair()) as twin:
         ports = [int(uri.rsplit(":", 1)[1]) for uri in twin.uris]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             for number in range(3000):
@@ -113,7 +113,7 @@ def test_cflib_still_connects_after_a_storm() -> None:
 
 @pytest.mark.clock
 def test_the_runner_survives_a_hostile_twin() -> None:
-    with Twin(StandIn()) as twin:
+    with Twin(SimplePair()) as twin:
         link = opened(twin)
         twin.drones[0].faults = DroneFaults(garbage=4.0)  # 800 datagrams a second
         end = time.monotonic() + 3.0
@@ -134,7 +134,7 @@ def test_the_runner_survives_a_hostile_twin() -> None:
 
 @pytest.mark.clock
 def test_connecting_to_a_hostile_twin_ends_one_way_or_the_other() -> None:
-    with Twin(StandIn()) as twin:
+    with Twin(SimplePair()) as twin:
         twin.drones[0].faults = DroneFaults(garbage=2.0)
         started = time.monotonic()
         with contextlib.suppress(LinkError):

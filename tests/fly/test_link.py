@@ -20,7 +20,7 @@ from mjxfly.packets import Setpoint
 from mjxfly.preflight import Preflight, reset_estimator
 from mjxfly.telemetry import WRAP, FirmwareClock
 from mjxfly.twin.conditions import DroneFaults, Injection, LinkFaults
-from mjxfly.twin.physics import StandIn
+from mjxfly.twin.physics import SimplePair
 from mjxfly.twin.server import HOST, Twin
 
 pytest.importorskip("cflib")
@@ -43,7 +43,7 @@ def nothing(kind: str, **fields: Any) -> None:
 
 @pytest.fixture
 def twin() -> Iterator[Twin]:
-    with Twin(StandIn()) as running:
+    with Twin(SimplePair()) as running:
         yield running
     assert running.failure is None
 
@@ -87,7 +87,7 @@ def test_log_requests_that_a_firmware_drops_are_repeated(
     A request to make, extend or start a block is lost once; one of each twice; all of them, for good.
     """
     for commands, times in (({6}, 1), ({7}, 1), ({3}, 1), ({3, 6}, 2), ({3, 6}, 10**6)):
-        with Twin(StandIn()) as twin:
+        with Twin(SimplePair()) as twin:
             receive, left = twin.drones[0].receive, [times]
 
             def lossy(datagram: bytes, now: float, receive=receive, left=left, commands=commands) -> None:  # type: ignore[no-untyped-def]
@@ -146,7 +146,7 @@ def test_tables_are_listed_once_for_a_firmware(
 ) -> None:
     """Defect 9: every connection read 595 table entries and 240 values, 11.6 s at 10 ms, and failed at 20 ms."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    with Twin(StandIn()) as twin:
+    with Twin(SimplePair()) as twin:
         requests: list[int] = []
         receive = twin.drones[0].receive
         monkeypatch.setattr(

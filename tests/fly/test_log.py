@@ -25,12 +25,12 @@ from mjxball.control.rotations import turned_about_z
 from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxfly import packets, recording
-from mjxfly.card import mount_angle
 from mjxfly.flight_log import STREAMS, Journal, Tail, read
 from mjxfly.limits import FlightSettings
 from mjxfly.log import main as draw
 from mjxfly.log_schema import KINDS, SCHEMA
 from mjxfly.packets import DroneState
+from mjxfly.policy_setup import mount_angle
 from mjxfly.recording import SILENCE, load, read_recording
 from mjxfly.rig import identify
 from mjxfly.view.main import main as view
@@ -125,7 +125,7 @@ def test_the_state_of_a_gru_is_recorded(tmp_path: Path) -> None:
         assert VirtualTwin(FlightSettings(seconds=3.0), contents=contents, log=log).run() == "done"
         log.note("end", code=0)
     recording, policy = read_recording(path), Policy(contents, "again")
-    angle = mount_angle(contents.card)
+    angle = mount_angle(contents.metadata)
     guided = np.isfinite(recording.observation).all(axis=1)
     assert guided.sum() > 100
     assert np.isnan(recording.hidden[~guided]).all()
@@ -134,7 +134,7 @@ def test_the_state_of_a_gru_is_recorded(tmp_path: Path) -> None:
         policy(turned_about_z(seen, -angle))
         assert policy.hidden is not None
         remembered.append(policy.hidden)
-    assert recording.hidden.shape[1] == contents.card["recurrent_units"] == len(remembered[0])
+    assert recording.hidden.shape[1] == contents.metadata["recurrent_units"] == len(remembered[0])
     np.testing.assert_allclose(recording.hidden[guided], remembered, atol=2e-4)
     assert np.std(remembered, axis=0).max() > 0.01
 

@@ -15,16 +15,16 @@ from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly import measured, probe
-from mjxfly.card import Controller
 from mjxfly.limits import FlightSettings
 from mjxfly.measured import CONTRADICTING, REPEATING, WINDOW, DroneWatch, ImuWatch, Repeats
 from mjxfly.mocap_supervision import Frame as PoseFrame
 from mjxfly.mocap_supervision import Pose
 from mjxfly.packets import DroneState
+from mjxfly.policy_setup import FlightController
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import Sample
 from mjxfly.twin.conditions import Surroundings
-from mjxfly.twin.virtual import VirtualTwin
+from virtual_twin import VirtualTwin
 
 PACKET = 0.02  # [s]
 Parts = tuple[float, ...]
@@ -168,8 +168,8 @@ def test_what_a_hand_has_not_shown_yet_is_asked_for() -> None:
         force = rotations.matrix_from_quaternion(quaternion).T @ pushed
         watch.turn(Sample(DroneState(size * moved, speed * moved, quaternion, speed * turned, 0, 3.9), time, time))
         assert watch.update(time, force, size * moved, quaternion) == "", time
-        if not asked or asked[-1] != watch.not_shown():
-            asked.append(watch.not_shown())
+        if not asked or asked[-1] != watch.unverified_axes():
+            asked.append(watch.unverified_axes())
     turn, move = "turn it 10 degrees about its", "move it 0.1 m along"
     assert asked == [
         f"{turn} x, y, z and {move} x, y, z", f"{turn} y, z and {move} x, y, z", f"{turn} z and {move} x, y, z",
@@ -206,7 +206,7 @@ HOVER = FlightSettings(seconds=30.0)
 
 def hovering(world: VirtualTwin, seconds: float) -> VirtualTwin:
     """`world` in the air, `seconds` after the laws took over at the goal."""
-    config, place = Controller(FLIGHT).config, [np.array([0.0, 0.0, 0.4]), np.zeros(3), np.zeros(3)]
+    config, place = FlightController(FLIGHT).config, [np.array([0.0, 0.0, 0.4]), np.zeros(3), np.zeros(3)]
     world.start_in_air(start_state(config, *place, np.float64(world.pair.conditions.object_mass), np.float64(0.0)))
     world.fly_for(seconds)
     assert world.flight.supervisor.state is FlightState.FLY

@@ -37,7 +37,7 @@ from mjxfly.twin.conditions import Surroundings
 pytest.importorskip("cflib")
 pytest.importorskip("motioncapture")
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-RIG = Rig.of_card(load_file(TRANSPORT).card)
+RIG = Rig.from_metadata(load_file(TRANSPORT).metadata)
 BODIES = ("lead", "follow")
 NO_DECK = Surroundings(deck=False)
 

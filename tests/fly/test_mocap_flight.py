@@ -47,7 +47,7 @@ class Flown:
     ):
         self.heard: list[list[tuple[float, np.ndarray]]] = [[], []]
         self.errors: list[float] = []
-        with urgent(), Twin(make_pair(load_file(policy).card, surroundings=around)) as twin:
+        with urgent(), Twin(make_pair(load_file(policy).metadata, surroundings=around)) as twin:
             for number, drone in enumerate(twin.drones):
                 drone.receive = functools.partial(self._hear, twin, number, drone.receive)  # type: ignore[method-assign]
 

@@ -7,13 +7,13 @@ import pytest
 from mjxball.control.crazyflie import PARAMETERS, Gains, pair_gains
 from mjxball.errors import InputError
 from mjxball.policy import Policy, shipped_policy
-from mjxfly.card import Controller, load_policy, variants
 from mjxfly.parameters import check_parameters
+from mjxfly.policy_setup import FlightController, load_policy, variants
 
 
 def refused(name: str, leader: Gains, follower: Gains) -> str:
     """Why the shipped policy `name` does not fly with these, empty if it does."""
-    config = Controller(Policy(load_policy(shipped_policy(name)), name)).config
+    config = FlightController(Policy(load_policy(shipped_policy(name)), name)).config
     try:
         check_parameters(config, list(variants(config)[0]), (leader, follower), "gains.json")
     except InputError as error:
@@ -23,7 +23,7 @@ def refused(name: str, leader: Gains, follower: Gains) -> str:
 
 def own(name: str) -> tuple[Gains, Gains]:
     """The card's gains."""
-    return pair_gains(Controller(Policy(load_policy(shipped_policy(name)), name)).config.autopilot)
+    return pair_gains(FlightController(Policy(load_policy(shipped_policy(name)), name)).config.autopilot)
 
 
 @pytest.mark.parametrize("name", ["flight", "stand", "flight-upgrade", "flight-brushless", "universal"])

@@ -17,18 +17,18 @@ from mjxball.control import rotations
 from mjxball.policy import Policy, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
-from mjxfly import card
+from mjxfly import policy_setup
 from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
 from mjxfly.log import main as draw
-from mjxfly.recording import Recording, _tick_remarks, fly_again, read_recording
+from mjxfly.recording import Recording, _tick_remarks, read_recording, simulate_setpoints
 from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
 from mjxfly.twin.physics import make_pair
 from mjxfly.view.main import main as view
 
 OLDER = drone_kind(curve="older")  # the motors of the preset
-EXACT = Surroundings(exact=True)  # neither the simulation nor `fly_again` has an estimator
+EXACT = Surroundings(exact=True)  # neither the simulation nor `simulate_setpoints` has an estimator
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=4.0, goal=(0.1, 0.0, 0.4))
-        physics = make_pair(contents.card, OLDER, EXACT)
+        physics = make_pair(contents.metadata, OLDER, EXACT)
         world = VirtualTwin(settings, contents=contents, physics=physics, log=notes)
         world.fly_until(FlightState.DONE)
     return path
@@ -58,8 +58,8 @@ def test_the_log_holds_the_flight(recording: Recording) -> None:
     # The leader and a copy of it: they climb and stay over the place, and drift along the stick as the CG moves.
     assert (np.abs(recording.position[flying][-1] - [0.1, 0.0, 0.4]) < [0.1, 0.5, 0.15]).all()
     assert recording.setup.curves == ("older", "older")  # as the motors said, whatever the header takes them for
-    config = card.with_curve(recording.config, "older")
-    assert recording.setup.gains == card.gains_of(config)
+    config = policy_setup.with_curve(recording.config, "older")
+    assert recording.setup.gains == policy_setup.gains_of(config)
     plant = config.plant
     weight = (sum(drone.mass for drone in plant.drones) + plant.object_mass) * plant.gravity
     # It hangs in the air for the last second: what the curve makes of the thrust that was sent is its weight.
@@ -80,7 +80,7 @@ def test_the_goal_is_shown_as_it_was_before_the_landing(recording: Recording) ->
 
 def test_the_same_commands_fly_the_same_way(recording: Recording) -> None:
     """The recorded setpoints alone, with no law that sees where it is, end where the flight ended."""
-    again = fly_again(recording, OLDER)
+    again = simulate_setpoints(recording, OLDER)
     # Setpoints take effect within a tick; 6 s later that has grown to a centimetre or two.
     np.testing.assert_allclose(again.position, recording.position, atol=0.03)
     euler = [rotations.euler_from_matrix(rotations.matrix_from_quaternion(r.quaternion)) for r in (again, recording)]
@@ -158,7 +158,7 @@ def test_what_is_damaged_in_a_log_is_left_out(log: Path, recording: Recording, t
 
 def test_ticks_are_held_against_those_that_the_policy_is_flown_with() -> None:
     """`universal` commands every 20 ms, in every second tick: each log of it was said to be off its period."""
-    config = card.config_of(card.load_policy(shipped_policy("universal")).card)
+    config = policy_setup.config_of(policy_setup.load_policy(shipped_policy("universal")).metadata)
     assert config.timing.control_period == 0.02
     for step, remarked in ((0.01, False), (0.02, True), (0.013, True)):
         assert bool(_tick_remarks([step * number for number in range(100)], config)) is remarked
@@ -167,6 +167,6 @@ def test_ticks_are_held_against_those_that_the_policy_is_flown_with() -> None:
 def test_other_plants_fly_again_on_the_stand_in(recording: Recording) -> None:
     ideal = dataclasses.replace(recording.config, autopilot=configs.Autopilot())
     short = {name: getattr(recording, name)[:50] for name in ("time", "sent", "position", "velocity", "rates")}
-    again = fly_again(dataclasses.replace(recording, config=ideal, **short))
+    again = simulate_setpoints(dataclasses.replace(recording, config=ideal, **short))
     assert np.isnan(again.cg_offset).all()
     assert np.isfinite(again.position).all()

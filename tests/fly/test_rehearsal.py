@@ -24,9 +24,9 @@ from tables import weekly
 
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
-from mjxfly import card
+from mjxfly import policy_setup
 from mjxfly.flight_log import read
-from mjxfly.recording import fly_again, read_recording
+from mjxfly.recording import read_recording, simulate_setpoints
 
 pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock
@@ -100,11 +100,11 @@ def flown(name: str, flights: dict[str, Ended]) -> Path:
 
 
 def test_the_cards_gains_are_uploaded(name: str, flown: Path) -> None:
-    config = card.config_of(load_file(shipped_policy(name)).card)
+    config = policy_setup.config_of(load_file(shipped_policy(name)).metadata)
     written = {
         (record["drone"], record["name"]): record["value"] for record in read(flown) if record["kind"] == "parameter"
     }
-    for drone, gains in zip(("leader", "follower"), card.gains_of(config), strict=True):
+    for drone, gains in zip(("leader", "follower"), policy_setup.gains_of(config), strict=True):
         for parameter, value in gains.items():
             assert written[drone, parameter] == pytest.approx(value, rel=1e-6)  # a float on the wire
     assert written["leader", "pid_rate.roll_ki"] > 0
@@ -122,7 +122,7 @@ def test_it_flies_and_its_commands_simulated_begin_the_same(name: str, flown: Pa
     # time (tests/fly/test_recording.py compares a whole flight, in virtual time). So: until one second in the air.
     begun = recording.time[recording.phase.index("fly")]
     early = recording.time < begun + 1.0
-    apart = fly_again(recording).position[early] - recording.position[early]
+    apart = simulate_setpoints(recording).position[early] - recording.position[early]
     assert np.abs(apart).max() < 0.05
 
 

@@ -12,15 +12,15 @@ from tables import weekly
 from mjxball.control import rotations
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.policy.team import is_for_any
-from mjxfly.card import Controller, goal_of, limits_of, load_policy
 from mjxfly.limits import FlightSettings, Times
+from mjxfly.policy_setup import FlightController, goal_of, limits_of, load_policy
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.takeoff import BEGIN, MOST_LIFT, TakeOff
 from mjxfly.telemetry import ObjectState, Rig
 from mjxfly.twin import avionics
 from mjxfly.twin.conditions import Conditions, Surroundings
-from mjxfly.twin.virtual import VirtualTwin
+from virtual_twin import VirtualTwin
 
 RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
 PERIOD = 0.01  # [s]
@@ -29,7 +29,7 @@ PERIOD = 0.01  # [s]
 def world_of(name: str, seconds: float, ball: float = 0.0, **around) -> VirtualTwin:
     pytest.importorskip("mujoco")
     policy = Policy(load_policy(shipped_policy(name)), name)
-    config = Controller(policy).config
+    config = FlightController(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
     settings = FlightSettings(seconds, goal, stand=stand, limits=limits_of(config, goal))
     conditions = dataclasses.replace(Conditions.of(config), ball=ball)
@@ -101,9 +101,11 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
 def test_attitudes_that_disagree_are_not_taken_for_motors_that_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each drone pushes its end to where it sees itself level: 35 - 46 degrees where the laws went on from there."""
     rolls = [rotations.quaternion_from_euler(np.array([math.radians(roll), 0.0, 0.0])) for roll in (1.5, -1.5)]
-    true = avionics.Onboard._attitude
+    true = avionics.OnboardComputers._attitude
     monkeypatch.setattr(
-        avionics.Onboard, "_attitude", lambda own, drone: rotations.multiply_quaternions(true(own, drone), rolls[drone])
+        avionics.OnboardComputers,
+        "_attitude",
+        lambda own, drone: rotations.multiply_quaternions(true(own, drone), rolls[drone]),
     )
     world = world_of("flight", 4.0)
     world.run(20.0)
@@ -113,12 +115,12 @@ def test_attitudes_that_disagree_are_not_taken_for_motors_that_do(monkeypatch: p
 
 def test_a_policy_for_any_rig_is_told_that_it_flies_crazyflies() -> None:
     told = load_policy(shipped_policy("universal"))
-    assert is_for_any(load_file(shipped_policy("universal")).card)
-    assert not is_for_any(told.card)
-    assert len(told.card["plant"]["drones"]) == 2
-    assert told.card["config"]["autopilot"]["kind"] == "crazyflie"
+    assert is_for_any(load_file(shipped_policy("universal")).metadata)
+    assert not is_for_any(told.metadata)
+    assert len(told.metadata["plant"]["drones"]) == 2
+    assert told.metadata["config"]["autopilot"]["kind"] == "crazyflie"
     flight = load_file(shipped_policy("flight"))
-    assert load_policy(shipped_policy("flight")).card == flight.card
+    assert load_policy(shipped_policy("flight")).metadata == flight.metadata
 
 
 def test_the_laws_take_over_in_the_air_and_remember_nothing_of_the_ground() -> None:
@@ -179,8 +181,8 @@ def test_what_holds_the_stick_level_is_what_hovers() -> None:
         leader, follower = one.needed([np.array([1.0, 0.0, 0.0, 0.0])] * 2)
         apart = 15.0 * math.radians(degrees) * 0.2 if taken else 0.0
         assert (leader, follower) == (pytest.approx(1 + apart, abs=0.01), pytest.approx(1 - apart, abs=0.01))
-    for law in ("paper", "calibrated"):
-        own = CommandMap(law)
+    for thrust_model in ("paper", "calibrated"):
+        own = CommandMap(thrust_model)
         assert own.scaled(1.1).hover_thrust == pytest.approx(1.1 * own.hover_thrust)
 
 

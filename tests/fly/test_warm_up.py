@@ -18,12 +18,12 @@ from mjxfly.warm_up import warm_up
 # one everything has been loaded.
 FIRST = """
 import json, sys
-from mjxfly.card import Controller
+from mjxfly.policy_setup import Controller
 from mjxfly.flight import Flight
 from mjxfly.limits import FlightSettings
 from mjxfly.telemetry import Rig
-from mjxfly.twin.physics import StandIn, StandInPlant
-from mjxfly.twin.virtual import VirtualTwin
+from mjxfly.twin.physics import SimplePair, SimplePlant
+from virtual_twin import VirtualTwin
 from mjxfly.warm_up import warm_up
 from mjxball.policy import Policy, shipped_policy
 
@@ -34,8 +34,8 @@ def audit(event, arguments):
         found.append([world.flight.supervisor.state.value, event])
 
 policy = Policy.load(shipped_policy("flight"))
-rig = Rig.of_card(policy.card)
-physics = StandIn(StandInPlant(mass=0.07, mounts=(rig.leader_mount, rig.follower_mount)))
+rig = Rig.from_metadata(policy.card)
+physics = SimplePair(SimplePlant(mass=0.07, mounts=(rig.leader_mount, rig.follower_mount)))
 world = VirtualTwin(policy, FlightSettings(seconds=1.0), physics=physics)
 tick = world.flight.tick
 

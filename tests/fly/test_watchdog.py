@@ -96,7 +96,7 @@ def test_on_the_ground_nothing_is_taken_over(last: int) -> None:
 @rows("trim", [0, 12000, 46000, 65535])
 def test_the_way_down_ends_in_stops_and_never_lifts(trim: int, height: float, climb: float) -> None:
     seen = LastKnownState((trim, trim // 2), height, climb, 0.0)
-    plans = [watchdog.way_down(number, seen, 0.3) for number in range(2)]
+    plans = [watchdog.descent_packets(number, seen, 0.3) for number in range(2)]
     assert len(plans[0]) == len(plans[1])
     for plan, own in zip(plans, seen.trims, strict=True):
         sent = [packets.unpack_setpoint(packet.data) for packet in plan if packet.port == 3]
@@ -140,7 +140,7 @@ def flown(place: Path, lose: Callable[[subprocess.Popen, Twin], None] | None, pr
 
     Returns once the twin's motors are off; None if it never took off.
     """
-    with urgent(), Twin(make_pair(load_file(TRANSPORT).card)) as twin:
+    with urgent(), Twin(make_pair(load_file(TRANSPORT).metadata)) as twin:
         sent = tuple(setpoint_times(drone) for drone in twin.drones)
         uris = ["--leader", twin.uris[0], "--follower", twin.uris[1]]
         log = place / f"{len(list(place.iterdir()))}.jsonl"

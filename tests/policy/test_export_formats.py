@@ -21,7 +21,7 @@ from mjxball import __version__
 from mjxball.cli import plant_setup
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import law_of, shipped_policy
+from mjxball.policy.file import controller_of, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 from mjxball.policy.quantize import balanced, rows_of
@@ -67,15 +67,15 @@ int main(void) {
 @pytest.fixture(scope="module")
 def direct(trained: Trained) -> PolicyFile:
     """A follower that commands directly, with other gains and limits."""
-    card = {**trained.contents.card, "action_mode": "direct", "command_limits": [0.1, 1.5]}
-    return dataclasses.replace(trained.contents, card=card)
+    metadata = {**trained.contents.metadata, "action_mode": "direct", "command_limits": [0.1, 1.5]}
+    return dataclasses.replace(trained.contents, metadata=metadata)
 
 
 @pytest.fixture(scope="module")
 def limited(remembering: Trained) -> PolicyFile:
     """A follower with everything that it can remember, whose PD law differs on every axis and meets its limits."""
-    card = {**remembering.contents.card, "leader_kp": [0.5, 0.7, 0.9], "leader_kd": [1.0, 1.2, 1.4]}
-    return dataclasses.replace(remembering.contents, card={**card, "command_limits": [0.05, 0.6]})
+    metadata = {**remembering.contents.metadata, "leader_kp": [0.5, 0.7, 0.9], "leader_kd": [1.0, 1.2, 1.4]}
+    return dataclasses.replace(remembering.contents, metadata={**metadata, "command_limits": [0.05, 0.6]})
 
 
 @pytest.fixture(
@@ -111,7 +111,7 @@ def flown(contents: PolicyFile, dtype: Any, policy: Policy | None = None) -> Fli
     """NumPy inference, by `policy` or `contents`, on observations that change as smoothly as a flight's."""
     policy, random = policy or Policy(contents, "follower", dtype), np.random.default_rng(3)
     walk = np.cumsum(random.normal(scale=0.03, size=(STEPS, 18)), axis=0) + random.normal(scale=0.3, size=18)
-    size = law_of(contents.card).size
+    size = controller_of(contents.metadata).size
     rows: dict[str, list[Any]] = {field.name: [] for field in dataclasses.fields(Flight)}
     for number, seen in enumerate(walk.astype(np.float32)):
         start = number % (STEPS // 2) == 0
@@ -239,20 +239,20 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert f"RAM: {cost.state} bytes" in text
     size, widest = map(int, re.search(r"mjxball_follower_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
     gates = re.search(r"given\[(\d+)\], kept\[(\d+)\], next\[(\d+)\], joined\[(\d+)\];", text)
-    assert (gates is None) == (law_of(contents.card).units == 0)
+    assert (gates is None) == (controller_of(contents.metadata).units == 0)
     own = sum(map(int, gates.groups())) if gates else 0
     assert 4 * (size + 2 * widest + own) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
     versions = re.search(r"trained by mjxball (\S+) .* exported by mjxball (\S+)\.\n", text).groups()
-    assert versions == (contents.card["package_version"], __version__)
+    assert versions == (contents.metadata["package_version"], __version__)
 
 
 @pytest.mark.slow
 def test_a_card_cannot_leave_the_comment(trained: Trained, tmp_path: Path):
     evil = '*/ #error "out" /* \\\n'
-    card = {**trained.contents.card, "preset": evil, "package_version": evil}
-    compiled(dataclasses.replace(trained.contents, card=card), tmp_path, "float")
+    metadata = {**trained.contents.metadata, "preset": evil, "package_version": evil}
+    compiled(dataclasses.replace(trained.contents, metadata=metadata), tmp_path, "float")
 
 
 @pytest.mark.parametrize("name", ["follower.onnx", "follower.h", "again.npz"])
@@ -291,10 +291,10 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
 def test_refusals(source: str, out: str, message: str, saved: Path, monkeypatch, capsys):
     shutil.copy(shipped_policy("universal"), saved.parent)
     (saved.parent / "taken.h").write_text("mine")
-    arrays, card = load_arrays(saved)
-    write_arrays(saved.parent / "older.npz", arrays, {**card, "format_version": 3})
-    del card["history"]
-    write_arrays(saved.parent / "broken.npz", arrays, card)
+    arrays, metadata = load_arrays(saved)
+    write_arrays(saved.parent / "older.npz", arrays, {**metadata, "format_version": 3})
+    del metadata["history"]
+    write_arrays(saved.parent / "broken.npz", arrays, metadata)
     before = listing(saved.parent)
     monkeypatch.chdir(saved.parent)
     assert call(main, [source, *out.split()]) == 2
@@ -313,7 +313,7 @@ def test_a_policy_that_was_told_its_team_flies_as_one_that_joined(tmp_path: Path
         np.testing.assert_allclose(told(seen), joined(np.stack([seen] * 3))[2], rtol=0, atol=1e-5)
     assert call(main, [out, tmp_path / "third.onnx"]) == 0  # it need not be told again
     mount = config.plant.drones[3].mount
-    assert told.card["team"]["mount_angle"] == pytest.approx(np.arctan2(-mount[1], -mount[0]))
+    assert told.metadata["team"]["mount_angle"] == pytest.approx(np.arctan2(-mount[1], -mount[0]))
 
 
 @pytest.mark.slow

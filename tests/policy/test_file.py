@@ -15,7 +15,7 @@ from conftest import Trained, policy_of
 from mjxball.control import observation as layout
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.export import policy_file
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 from mjxball.train.extensions import DEFAULTS, make_env
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
@@ -32,7 +32,7 @@ class TestRoundTrip:
         loaded = load_file(saved)
         for field in dataclasses.fields(PolicyFile):
             expected, found = getattr(trained.contents, field.name), getattr(loaded, field.name)
-            if field.name == "card":
+            if field.name == "metadata":
                 assert found == json.loads(json.dumps(expected))  # tuples become lists
             else:
                 jax.tree.map(np.testing.assert_array_equal, found, expected)
@@ -47,12 +47,14 @@ class TestRoundTrip:
         policy = Policy.load(saved)
         assert policy.name == "follower"
         assert policy.control_period == trained.config.timing.control_period
-        assert policy.card["training_steps"] == 1234
+        assert policy.metadata["training_steps"] == 1234
 
     def test_saving_leaves_nothing_else_behind_and_replaces_the_old_file(self, trained, saved):
-        save_file(saved, dataclasses.replace(trained.contents, card={**trained.contents.card, "training_steps": 5}))
+        save_file(
+            saved, dataclasses.replace(trained.contents, metadata={**trained.contents.metadata, "training_steps": 5})
+        )
         assert [path.name for path in saved.parent.iterdir()] == ["follower.npz"]
-        assert load_file(saved).card["training_steps"] == 5
+        assert load_file(saved).metadata["training_steps"] == 5
 
     @pytest.mark.parametrize("existing", [False, True], ids=["new", "over an old file"])
     def test_unsound_policy_writes_nothing(self, trained, tmp_path, existing):
@@ -184,7 +186,7 @@ def test_export_takes_the_averaged_policy(trained):
     learner = trained.learner._replace(policy=jax.tree.map(jnp.zeros_like, trained.learner.policy))
     contents = policy_file(
         trained.config,
-        follower_law(trained.config),
+        follower_controller(trained.config),
         policy_of(make_env(DEFAULTS, trained.config, "newton-euler"), learner),
         steps=1,
     )

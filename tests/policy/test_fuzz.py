@@ -170,8 +170,8 @@ class TestFoundHoles:
     def test_card_with_another_configuration(self, config: object, tmp_path: Path) -> None:
         with np.load(TRANSPORT) as data:
             arrays = dict(data)
-        card = {**json.loads(str(arrays.pop("card"))), "config": config}
-        np.savez(tmp_path / "config.npz", **arrays, card=np.array(json.dumps(card)))
+        metadata = {**json.loads(str(arrays.pop("card"))), "config": config}
+        np.savez(tmp_path / "config.npz", **arrays | {"card": np.array(json.dumps(metadata))})
         self.refused(tmp_path / "config.npz", "config")
 
     @pytest.mark.parametrize(

@@ -210,13 +210,13 @@ def test_another_number_of_flights_is_refused_before_a_reset() -> None:
 def test_many_threads_with_the_pure_law_fly_as_one_does() -> None:
     """State in, state out: four flights at once on one policy, each as if it were alone."""
     for name in POLICIES:
-        law = policy(name).law
+        controller = policy(name).controller
 
-        def flight(number: int, law: Any = law) -> np.ndarray:
+        def flight(number: int, controller: Any = controller) -> np.ndarray:
             flown, commands = SEEN[:15].astype(np.float32) + np.float32(0.01 * number), []
-            memory = law.start(flown[0])
+            memory = controller.start(flown[0])
             for seen in flown:
-                _, command, memory = law.answer(memory, seen)
+                _, command, memory = controller.answer(memory, seen)
                 commands.append(command)
             return np.array(commands)
 

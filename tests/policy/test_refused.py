@@ -50,11 +50,11 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     np.savez(path, **arrays)
 
 
-def rewrite_card(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+def rewrite_metadata(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Save the card of `path` again after `change`."""
-    card = json.loads(str(arrays_of(path)["card"]))
-    change(card)
-    rewrite(path, lambda arrays: arrays.update(card=np.array(json.dumps(card))))
+    metadata = json.loads(str(arrays_of(path)["card"]))
+    change(metadata)
+    rewrite(path, lambda arrays: arrays.update({"card": np.array(json.dumps(metadata))}))
 
 
 class Bomb:
@@ -205,13 +205,15 @@ class TestDamagedArrays:
 
     def test_action_without_range(self, saved):
         """The card and the array agree that roll and pitch have a range of 0."""
-        rewrite_card(saved, lambda card: card.update(action_reach=[0.0, card["action_reach"][1]]))
+        rewrite_metadata(saved, lambda metadata: metadata.update(action_reach=[0.0, metadata["action_reach"][1]]))
         rewrite(saved, lambda arrays: np.put(arrays["action_scale"], [0, 1], 0.0))
         refused(saved, "action_scale must be positive")
 
-    @pytest.mark.parametrize("card", [np.zeros(3), np.array(["{}"]), np.array(b"{}"), np.array("{"), np.array("[1]")])
-    def test_card_is_not_one_json_object(self, saved, card):
-        rewrite(saved, lambda arrays: arrays.update(card=card))
+    @pytest.mark.parametrize(
+        "metadata", [np.zeros(3), np.array(["{}"]), np.array(b"{}"), np.array("{"), np.array("[1]")]
+    )
+    def test_card_is_not_one_json_object(self, saved, metadata):
+        rewrite(saved, lambda arrays: arrays.update({"card": metadata}))
         refused(saved, "card")
 
 
@@ -221,7 +223,7 @@ class TestDamagedCard:
     )
     def test_a_format_on_an_lqg_names_the_last_version_that_flies_it(self, saved, version, kind, capsys):
         """Whatever its arrays are, and on the command line."""
-        rewrite_card(saved, lambda card: card.update(format_version=version))
+        rewrite_metadata(saved, lambda metadata: metadata.update(format_version=version))
         rewrite(saved, lambda arrays: arrays.update(weight_0=arrays["weight_0"][:3]))
         refused(saved, f"has policy format {version}, a network on top of {kind}")
         refused(saved, ": mjxball 0.1.0 is the last version that flies it")
@@ -229,14 +231,14 @@ class TestDamagedCard:
 
     @pytest.mark.parametrize("version", [0, 6, "1", None, True, [1], 1.5, HUGE], ids=lambda v: repr(v)[:5])
     def test_unknown_format_version(self, saved, version):
-        rewrite_card(saved, lambda card: card.update(format_version=version))
+        rewrite_metadata(saved, lambda metadata: metadata.update(format_version=version))
         refused(saved, "format")
 
     def test_every_field_is_needed(self, saved, trained):
         content = saved.read_bytes()
         for field in ("history", "observation", "action_reach", "gravity", "control_period", "plant", "bounds"):
             saved.write_bytes(content)
-            rewrite_card(saved, lambda card, field=field: card.pop(field))
+            rewrite_metadata(saved, lambda metadata, field=field: metadata.pop(field))
             refused(saved, field)
 
     @pytest.mark.parametrize(
@@ -254,11 +256,11 @@ class TestDamagedCard:
         ids=["name", "unit", "missing", "extra", "extra without unit", "order", "empty", "text"],
     )
     def test_other_observation(self, saved, observation):
-        rewrite_card(saved, lambda card: card.update(observation=observation(card["observation"])))
+        rewrite_metadata(saved, lambda metadata: metadata.update(observation=observation(metadata["observation"])))
         refused(saved, "observation")
 
     def test_other_action(self, saved):
-        rewrite_card(saved, lambda card: card.update(action=card["action"][::-1]))
+        rewrite_metadata(saved, lambda metadata: metadata.update(action=metadata["action"][::-1]))
         refused(saved, "action")
 
     @pytest.mark.parametrize(
@@ -304,13 +306,13 @@ class TestDamagedCard:
         ids=lambda value: "huge" if value == HUGE else repr(value)[:20],
     )
     def test_impossible_field(self, saved, field, value):
-        rewrite_card(saved, lambda card: card.update({field: value}))
+        rewrite_metadata(saved, lambda metadata: metadata.update({field: value}))
         refused(saved)
 
     def test_residual_policy_of_unknown_plant_still_loads(self, saved, capsys):
         """The network does not use the plant, so that settings of another version are no damage; evaluation does."""
-        rewrite_card(saved, lambda card: card["plant"].update(leader_mass=1.0))
-        assert Policy.load(saved).card["plant"]["leader_mass"] == 1.0
+        rewrite_metadata(saved, lambda metadata: metadata["plant"].update(leader_mass=1.0))
+        assert Policy.load(saved).metadata["plant"]["leader_mass"] == 1.0
         said = assert_refused(evaluate.main, [saved], saved.parent, capsys)
         assert f"{saved}: configuration" in said
         assert "unknown leader_mass; mjxball 0.1.0 is the last version that reads" in said
@@ -375,11 +377,11 @@ def test_mutated_array_header_loads_or_is_refused(saved, data):
 @given(data=st.data())
 def test_mutated_card_loads_or_is_refused(saved, data):
     """Any JSON value in place of any field, behind an intact zip."""
-    card = json.loads(str(arrays_of(saved)["card"]))
+    metadata = json.loads(str(arrays_of(saved)["card"]))
     number = st.one_of(st.integers(), st.floats(), st.just(HUGE), st.booleans(), st.none(), st.text(max_size=5))
     value = st.recursive(
         number, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
     )
-    field = data.draw(st.sampled_from(sorted(card)))
+    field = data.draw(st.sampled_from(sorted(metadata)))
     with damaged(saved):
-        rewrite_card(saved, lambda card: card.update({field: data.draw(value)}))
+        rewrite_metadata(saved, lambda metadata: metadata.update({field: data.draw(value)}))

@@ -13,7 +13,7 @@ from tables import rows
 from mjxball.config import PRESETS, Config, apply_overrides, preset
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.sim.laws import MAX_LIFT_DIFFERENCE, WASHOUT_TIME, BodyState, Laws
+from mjxball.sim.controllers import MAX_LIFT_DIFFERENCE, WASHOUT_TIME, BodyState, Controllers
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -30,8 +30,8 @@ def body(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), euler=(0.0, 0.0, 0.
     )
 
 
-def started(config: Config) -> tuple[Laws, np.ndarray]:
-    loop = Laws(config)
+def started(config: Config) -> tuple[Controllers, np.ndarray]:
+    loop = Controllers(config)
     return loop, loop.zero_integral(np.zeros(3))
 
 
@@ -123,12 +123,12 @@ class TestStand:
 
     def test_in_free_flight_everything_is_seen(self) -> None:
         felt = body((0.023, -0.023, 0.05), (0.165, 0.1, 0.02), (0.03, 0.01, 0.5), (0.1, 0.05, 0.2))
-        assert np.abs(Laws(preset("flight")).observe(felt, np.ones(3))).min() > 0
+        assert np.abs(Controllers(preset("flight")).observe(felt, np.ones(3))).min() > 0
 
 
 @pytest.mark.parametrize("error", ["object", "leader"])
 def test_an_observation_tells_the_body_that_it_was_made_of(error: str) -> None:
-    loop = Laws(apply_overrides(preset("flight"), {"follower.error": error}))
+    loop = Controllers(apply_overrides(preset("flight"), {"follower.error": error}))
     goal = np.array([0.3, -0.2, 0.4])
     state = body((0.1, 0.2, 0.3), (0.1, -0.2, 0.05), (0.05, -0.03, 0.4), (0.3, 0.2, -0.1))
     again = loop.body_from_observation(loop.observe(state, goal), goal)

@@ -29,17 +29,17 @@ from mjxball.sim.outside import outside
 from mjxball.sim.rigs import (
     LEAST_DAMPING,
     TRAINING,
-    draw_rigs,
     held_out,
     loop_damping,
     rig_config,
+    sample_rigs,
     trimmed_reach,
     unpadded,
     whole,
 )
 from mjxball.sim.rollout import load_of, simulate, start_of
 from mjxball.sim.scenario import Scenario
-from random_rigs import AnyRigLaw, fly, rig_laws, stacked
+from random_rigs import AnyRigController, fly, rig_controllers, stacked
 
 UNIVERSAL = preset("universal")
 POLICY = shipped_policy("universal")
@@ -61,7 +61,7 @@ def test_a_row_is_the_plant_of_its_configuration() -> None:
 
 
 def test_draws_are_seeded_within_their_ranges_and_never_those_of_training() -> None:
-    drawn, again = draw_rigs(UNIVERSAL, 3, 40, TRAINING), draw_rigs(UNIVERSAL, 3, 40, TRAINING)
+    drawn, again = sample_rigs(UNIVERSAL, 3, 40, TRAINING), sample_rigs(UNIVERSAL, 3, 40, TRAINING)
     assert drawn.draws == again.draws
     assert drawn.unstable > 0
     np.testing.assert_array_equal(drawn.rigs.reach, again.rigs.reach)
@@ -106,20 +106,20 @@ def test_a_wrong_belief_takes_from_what_tilt_commands_hold() -> None:
 
 def test_rig_laws_fly_together_as_each_alone() -> None:
     rigs = held_out(UNIVERSAL, 3, 3)
-    laws = rig_laws(UNIVERSAL, rigs, SlowKnownRigLqg)
-    numbers, rebuild = stacked(laws)
+    controllers = rig_controllers(UNIVERSAL, rigs, SlowKnownRigLqg)
+    numbers, rebuild = stacked(controllers)
     random = np.random.default_rng(0)
     observation = 0.1 * random.standard_normal((2, 18))
-    for row, law in enumerate(laws):
+    for row, controller in enumerate(controllers):
         known = PrivilegedInfo(np.full(2, 0.3), None, None, np.full(2, 4.0), np.ones((2, 3)))
-        alone = law.step(law.start(observation), observation, known)[1]
+        alone = controller.step(controller.start(observation), observation, known)[1]
         together = rebuild([part[row] for part in numbers])
         np.testing.assert_array_equal(together.step(together.start(observation), observation, known)[1], alone)
 
 
 @pytest.mark.release
 def test_a_padded_rig_flies_as_it_does_alone() -> None:
-    rigs = draw_rigs(UNIVERSAL, 3, 2, 7).rigs
+    rigs = sample_rigs(UNIVERSAL, 3, 2, 7).rigs
     alone = dataclasses.replace(
         rig_config(UNIVERSAL, rigs, 0), attitude=UNIVERSAL.attitude, rigs=dataclasses.replace(UNIVERSAL.rigs, number=1)
     )
@@ -204,8 +204,8 @@ class TestUniversal:
     @pytest.mark.parametrize("size", [2, pytest.param(5, marks=pytest.mark.release)])
     def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
         rigs = held_out(UNIVERSAL, size, 4)
-        law = AnyRigLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
-        found = [one for own in fly(UNIVERSAL, rigs, law, flights=2, seconds=21.0) for one in own]
+        controller = AnyRigController(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
+        found = [one for own in fly(UNIVERSAL, rigs, controller, flights=2, seconds=21.0) for one in own]
         assert not any(one.failed for one in found)
         assert np.median([one.peak for one in found]) < 0.1
 
@@ -274,9 +274,9 @@ class TestUniversal:
 
     def test_another_context_is_refused(self, tmp_path: object) -> None:
         contents = load_file(POLICY)
-        card = json.loads(json.dumps(contents.card)) | {"context": ["mass"]}
+        metadata = json.loads(json.dumps(contents.metadata)) | {"context": ["mass"]}
         with pytest.raises(InputError, match="needs another context"):
-            save_file(f"{tmp_path}/odd.npz", dataclasses.replace(contents, card=card))
+            save_file(f"{tmp_path}/odd.npz", dataclasses.replace(contents, metadata=metadata))
 
 
 def test_rigs_need_numbers_of_drones() -> None:

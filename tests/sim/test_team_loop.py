@@ -14,8 +14,8 @@ from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
+from mjxball.sim.controllers import BodyState, Controllers
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.laws import BodyState, Laws
 from mjxball.sim.rollout import load_of, make_privileged_info, simulate, simulate_batch, start_of
 from mjxball.sim.scenario import CIRCLE, Scenario
 
@@ -51,21 +51,21 @@ def test_every_follower_sits_on_the_negative_half_of_its_own_x(name: str) -> Non
 def test_commands_stand_in_the_order_of_the_drones(leader: int) -> None:
     plant = dataclasses.replace(TEAM4.plant, leader=leader)
     own = np.arange(12.0).reshape(4, 3)  # of drone 0, 1, 2, 3
-    laws = Laws(dataclasses.replace(TEAM4, plant=plant))
-    np.testing.assert_array_equal(laws.stack(own[leader], own[list(plant.followers)]), own)
+    controllers = Controllers(dataclasses.replace(TEAM4, plant=plant))
+    np.testing.assert_array_equal(controllers.stack(own[leader], own[list(plant.followers)]), own)
 
 
 def test_a_follower_across_from_the_leader_sees_what_a_pairs_follower_sees() -> None:
     """Drone 2 of the ring of four sits where a pair's follower does, and its mount frame is the body's."""
     body, goal = some_body(), np.array([0.4, -0.3, 0.8])
     far = dataclasses.replace(TEAM4.plant, drones=TEAM4.plant.drones[::2], cg_axis="x")
-    alone = Laws(dataclasses.replace(TEAM4, plant=far)).observe(body, goal)
-    np.testing.assert_allclose(Laws(TEAM4).observe(body, goal)[1], alone, atol=1e-12)
+    alone = Controllers(dataclasses.replace(TEAM4, plant=far)).observe(body, goal)
+    np.testing.assert_allclose(Controllers(TEAM4).observe(body, goal)[1], alone, atol=1e-12)
 
 
 def test_followers_of_a_ring_see_the_same_flight_from_their_own_side() -> None:
     """Small tilts: what drone 1 sees is what drone 2 sees of the flight turned by the angle between them."""
-    loop, goal, angles = Laws(TEAM4), np.array([0.4, -0.3, 0.8]), mount_angles(TEAM4.plant)
+    loop, goal, angles = Controllers(TEAM4), np.array([0.4, -0.3, 0.8]), mount_angles(TEAM4.plant)
     calm = some_body()
     euler = 1e-5 * rotations.euler_from_matrix(rotations.matrix_from_quaternion(calm.quaternion))
     calm = calm._replace(quaternion=rotations.quaternion_from_euler(euler))
@@ -77,7 +77,7 @@ def test_followers_of_a_ring_see_the_same_flight_from_their_own_side() -> None:
 
 
 def test_copying_in_the_own_frame_is_copying_in_the_bodys() -> None:
-    loop, body, goal = Laws(TEAM4), some_body(), np.array([0.1, -0.1, 0.2])
+    loop, body, goal = Controllers(TEAM4), some_body(), np.array([0.1, -0.1, 0.2])
     still = body._replace(velocity=0.01 * body.velocity, position=0.1 * body.position)
     copied = copying(TEAM4)(loop.observe(still, goal))
     led = loop.leader_command(still, goal, loop.zero_integral(goal))
@@ -86,7 +86,7 @@ def test_copying_in_the_own_frame_is_copying_in_the_bodys() -> None:
 
 
 def test_an_observation_of_a_team_tells_the_body_that_it_was_made_of() -> None:
-    loop, body, goal = Laws(TEAM4), some_body(), np.array([0.1, -0.1, 0.2])
+    loop, body, goal = Controllers(TEAM4), some_body(), np.array([0.1, -0.1, 0.2])
     again = loop.body_from_observation(loop.observe(body, goal), goal)
     for mine, theirs in zip(again, body, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-12)

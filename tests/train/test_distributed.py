@@ -101,7 +101,7 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
     assert f"continuing {run} after" in outputs[0]
     assert checkpoints(run)[-1] > kept
     for seed in (0, 1):
-        assert Policy.load(run / "members" / f"seed{seed}.npz").card["training_steps"] >= kept
+        assert Policy.load(run / "members" / f"seed{seed}.npz").metadata["training_steps"] >= kept
 
 
 @pytest.mark.slow

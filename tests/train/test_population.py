@@ -163,19 +163,19 @@ def test_population_run_exports_every_member_and_the_best(
     assert "seed7" in printed
     assert "x_peak: median" in printed
     members = [Policy.load(out / "members" / f"seed{seed}.npz") for seed in (7, 8)]
-    assert [member.card["action_reach"][0] for member in members] == [0.1, 0.2]
+    assert [member.metadata["action_reach"][0] for member in members] == [0.1, 0.2]
     best = best_member(read_members(out))
     exported, own = load_file(out / "policy.npz"), load_file(out / "members" / f"seed{7 + best}.npz")
     for mine, theirs in zip(exported.weights, own.weights, strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    spread = exported.card.pop("population")
-    assert exported.card == own.card
+    spread = exported.metadata.pop("population")
+    assert exported.metadata == own.metadata
     assert spread["seed"] == [7, 8]
     assert len(spread["x_peak"]) == len(spread["rmse"]) == 2
-    assert own.card["curve"]["eval_return"][-1] == pytest.approx(
-        max(row["eval_return"] for row in read_members(out) if row["steps"] == own.card["training_steps"]), abs=1e-3
+    assert own.metadata["curve"]["eval_return"][-1] == pytest.approx(
+        max(row["eval_return"] for row in read_members(out) if row["steps"] == own.metadata["training_steps"]), abs=1e-3
     )
-    assert own.card["hardware"].endswith(" CPU cores")
+    assert own.metadata["hardware"].endswith(" CPU cores")
     assert (out / "eval" / "members.png").stat().st_size > 10_000
     assert train(["--resume", str(out)]) == 0
 

@@ -62,8 +62,8 @@ def runs(trained, tmp_path: Path) -> list[Path]:
         rows = [{**row, "steps": 50, "eval_return": 0.0} for row in rows] + rows
         write_rows(run / "members.csv", list(rows[0]), rows)
         for seed in seeds:
-            card = {**trained.contents.card, "seed": seed}
-            save_file(run / "members" / f"seed{seed}.npz", dataclasses.replace(trained.contents, card=card))
+            metadata = {**trained.contents.metadata, "seed": seed}
+            save_file(run / "members" / f"seed{seed}.npz", dataclasses.replace(trained.contents, metadata=metadata))
         made.append(run)
     return made
 

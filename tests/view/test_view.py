@@ -19,7 +19,7 @@ from mjxball.policy import load_file, shipped_policy
 from mjxball.view.flight import Flight, check_flight, flight_from, load_flight, save_flight, shapes
 from mjxball.view.main import main
 from mjxball.view.page import flight_page, page_contents, plant_of
-from mjxfly.card import config_of
+from mjxfly.policy_setup import config_of
 
 SECONDS = 4.0
 
@@ -56,7 +56,7 @@ def test_what_is_flown_is_the_reference(flight: Flight):
     ("name", "title"), [("flight", "flight: CG ±{cg:g} cm at 0.31 rad/s"), ("stand", "stand: ball from {ball:g} cm")]
 )
 def test_a_policy_for_crazyflies_flies_its_own_plant(name: str, title: str):
-    ranges = config_of(load_file(shipped_policy(name)).card).scenario
+    ranges = config_of(load_file(shipped_policy(name)).metadata).scenario
     title = title.format(cg=100 * ranges.cg_amplitude[1], ball=100 * ranges.ball_start)
     shown = flight_from(str(shipped_policy(name)), {"seconds": 1.0}, "newton-euler")
     assert shown.title == f"{title}, 0.0175 kg"

@@ -18,8 +18,8 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 from mjxball import __version__
 from mjxball.control import observation as layout
 from mjxball.control.followers import MAX_OBSERVATION
-from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.inference import NetworkLaw, Policy, known_geometry
+from mjxball.policy.file import PolicyFile, controller_of
+from mjxball.policy.inference import NetworkController, Policy, known_geometry
 
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
 BATCH = "flights"
@@ -159,17 +159,17 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     A policy that needs the geometry of its team is exported for one follower, named by `team` in its metadata. That
     follower observes and commands in its mount frame.
     """
-    graph, around = Graph(), law_of(contents.card)
-    law = NetworkLaw(Policy(contents, "traced", np.float32))
+    graph, around = Graph(), controller_of(contents.metadata)
+    controller = NetworkController(Policy(contents, "traced", np.float32))
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
     sound = _is_below(MAX_OBSERVATION, observation)
     seen = _where(sound, observation, np.zeros(1))
-    begun = memory = around.start(seen, known_geometry(contents.card, name))
+    begun = memory = around.start(seen, known_geometry(contents.metadata, name))
     if around.size:
         inputs += [_value("memory", TensorProto.FLOAT, around.size), _value("start", TensorProto.BOOL, 1)]
         memory = _where(TracedArray(graph, "start", 1), begun, TracedArray(graph, "memory", around.size))
-    action, command, following = law.answer(memory, seen)
+    action, command, following = controller.answer(memory, seen)
     finite = _is_below(float(np.finfo(np.float32).max), *([memory, following] if around.size else []), action, command)
     valid = sound.binary("And", sound, finite)
     results = {label: _where(valid, value, np.zeros(1)) for label, value in (("action", action), ("command", command))}
@@ -184,7 +184,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     maker = {"producer_name": "mjxball", "producer_version": __version__}
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], **maker)
     model.ir_version = IR_VERSION
-    helper.set_model_props(model, {"name": name, "card": json.dumps(contents.card, sort_keys=True)})
+    helper.set_model_props(model, {"name": name, "card": json.dumps(contents.metadata, sort_keys=True)})
     onnx.checker.check_model(model, full_check=True)
     return model
 

@@ -13,10 +13,10 @@ import pytest
 from onboard_bench import AT_REST, Bench, compilers, cores_by, cores_of, needs_gcc, policy_of
 from tables import rows
 
-from mjxball.policy.file import law_of
+from mjxball.policy.file import controller_of
 from mjxfly.app.host import App
 from mjxfly.app.protocol import CAUSES, AppPhase
-from mjxfly.card import config_of, variants
+from mjxfly.policy_setup import config_of, variants
 from mjxfly.telemetry import Rig
 
 WILD = (math.nan, math.inf, -3e38)
@@ -30,7 +30,7 @@ LIMIT, LEAST, MOST = 15.001, 10001, 60000  # [deg], [thrust units] of what is se
 @functools.cache
 def taken_off(name: str = "flight") -> Bench:
     """A pair in the first period of its laws."""
-    bench = Bench(cores_of(name), Rig.of_card(policy_of(name).card))
+    bench = Bench(cores_of(name), Rig.from_metadata(policy_of(name).metadata))
     bench.take_off()
     assert bench.phases == [AppPhase.FLY] * 2
     return bench
@@ -94,7 +94,7 @@ def test_the_curve_that_spinning_motors_show_is_flown():
                 app.set("curve", 1)
         assert bench.phases == [AppPhase.SPIN] * 2
     sent = [[numbers(bench.tick(AppPhase.RAMP)) for _ in range(150)] for bench in (known, found)]
-    hovers = [own["older"].map.hover_thrust for own in variants(config_of(policy_of("flight").card))]
+    hovers = [own["older"].map.hover_thrust for own in variants(config_of(policy_of("flight").metadata))]
     ramped = [10_001 + 0.8 * (hover - 10_001) for hover in hovers]  # 1.2 of 1.5 s
     np.testing.assert_allclose([thrust for _, _, thrust in sent[1][120]], ramped, rtol=0.01)
     assert sent[1] == sent[0]
@@ -209,7 +209,7 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
 @rows("name", ["recurrent flight", "universal"])
 def test_a_state_of_the_network_that_is_not_finite_lands_the_pair(name: str):
     """The law of `copy` flies on from the same period; what cannot be is forgotten."""
-    size = law_of(policy_of(name).card).size
+    size = controller_of(policy_of(name).metadata).size
     for value in (math.nan, math.inf, -math.inf):
         bench = flying(name)
         app = bench.apps[1]

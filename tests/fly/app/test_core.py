@@ -12,11 +12,11 @@ from onboard_bench import AT_REST, Bench, cores_of, needs_gcc, policy_of
 
 from mjxball.control import rotations
 from mjxball.policy import Policy
-from mjxball.sim.laws import Laws
+from mjxball.sim.controllers import Controllers
 from mjxfly.app import generate, protocol
 from mjxfly.app.host import App
 from mjxfly.app.protocol import CAUSES, AppPhase
-from mjxfly.card import Controller
+from mjxfly.policy_setup import FlightController
 from mjxfly.telemetry import ObjectState, Rig
 
 
@@ -25,8 +25,8 @@ from mjxfly.telemetry import ObjectState, Rig
 def test_the_apps_command_what_the_laptop_would(name: str):
     """Leader and follower over 5 s of motion: float32 on board, float64 laws on the laptop."""
     policy = policy_of(name)
-    bench = Bench(cores_of(name), Rig.of_card(policy.card))
-    controller = Controller(Policy(policy, name))
+    bench = Bench(cores_of(name), Rig.from_metadata(policy.metadata))
+    controller = FlightController(Policy(policy, name))
     free = controller.config.plant.stand == "free"
     goal = np.array([0.0, 0.0, 0.4 if free else 0.08])
     random, euler = np.random.default_rng(0), np.zeros(3)
@@ -59,14 +59,14 @@ def test_the_apps_command_what_the_laptop_would(name: str):
 def test_the_laptop_turns_into_mount_frames_as_teams_do():
     """A pair along y, whose follower's frame is turned by a right angle, beside the same rig as a team."""
     policy = policy_of("universal")
-    controller, random = Controller(Policy(policy, "universal")), np.random.default_rng(1)
+    controller, random = FlightController(Policy(policy, "universal")), np.random.default_rng(1)
     config = controller.config
-    laws = Laws(dataclasses.replace(config, plant=dataclasses.replace(config.plant, cg_axis="xy")))
+    controllers = Controllers(dataclasses.replace(config, plant=dataclasses.replace(config.plant, cg_axis="xy")))
     alone, goal = Policy(policy, "universal"), np.array([0.0, 0.0, 0.4])
     for _ in range(5):
         place, velocity, rates, euler = random.normal(scale=0.02, size=(4, 3))
         pair = ObjectState(place, velocity, rotations.quaternion_from_euler(euler), rates)
-        wanted = laws.in_body_axes(np.asarray(alone(laws.observe(pair, goal)), float))
+        wanted = controllers.in_body_axes(np.asarray(alone(controllers.observe(pair, goal)), float))
         np.testing.assert_allclose(controller.step(pair, goal).follower, wanted, rtol=0, atol=1e-6)
 
 
@@ -74,7 +74,7 @@ def test_the_laptop_turns_into_mount_frames_as_teams_do():
 @pytest.mark.parametrize("name", ["recurrent flight", "universal"])
 def test_a_flight_begins_with_an_empty_state(name: str):
     """A second one without a reboot, after motion that the first one remembers, is the first one again."""
-    bench = Bench(cores_of(name), Rig.of_card(policy_of(name).card))
+    bench = Bench(cores_of(name), Rig.from_metadata(policy_of(name).metadata))
     flights: list[list[Any]] = []
     for _ in range(2):
         bench.take_off()
@@ -100,7 +100,7 @@ REFUSED: tuple[tuple[str, Any], ...] = (
 
 @needs_gcc
 def test_an_app_refuses_to_start():
-    rig = Rig.of_card(policy_of("flight").card)
+    rig = Rig.from_metadata(policy_of("flight").metadata)
     for text, spoil in REFUSED:
         bench = Bench(cores_of(), rig)
         bench.tick(AppPhase.IDLE)
@@ -131,7 +131,7 @@ def test_an_app_refuses_to_start():
 @needs_gcc
 def test_one_abort_lands_both():
     """Whatever the leader finds moves the follower within two periods, and the other way round for silence."""
-    rig = Rig.of_card(policy_of("flight").card)
+    rig = Rig.from_metadata(policy_of("flight").metadata)
     for wrong, phase, text in (
         ({"position": [5.0, 0.15, 0.0]}, AppPhase.DESCEND, "beyond the fence"),
         ({"position": [float("inf"), 0.0, 0.0]}, AppPhase.DESCEND, "the state is old or not finite"),
@@ -167,7 +167,7 @@ def test_one_abort_lands_both():
 def test_nobody_lands_who_has_not_flown():
     """An order to land stops motors that spin; on a ramp it ends in the descent, which needs no law."""
     for periods, phase in ((3, AppPhase.STOP), (50, AppPhase.DESCEND)):
-        bench = Bench(cores_of(), Rig.of_card(policy_of("flight").card))
+        bench = Bench(cores_of(), Rig.from_metadata(policy_of("flight").metadata))
         for number in range(periods):
             bench.tick(AppPhase.IDLE if number == 0 else AppPhase.SPIN if number < 3 else AppPhase.RAMP)
         bench.tick(AppPhase.LAND)
@@ -177,7 +177,7 @@ def test_nobody_lands_who_has_not_flown():
 @needs_gcc
 def test_another_pair_on_the_channel_is_not_obeyed():
     """In flight a leader of another policy is not heard; on the ground it is a reason not to start."""
-    rig = Rig.of_card(policy_of("flight").card)
+    rig = Rig.from_metadata(policy_of("flight").metadata)
 
     def heard(bench: Bench, phase: AppPhase, order: AppPhase, ours: bool) -> App:
         """The follower after a beat of the leader's in this phase."""

@@ -116,7 +116,7 @@ int main(void) {
 def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
     """Both apps over take-off, motion of the pair, landing and a fence that is left, whose inputs were recorded."""
     policy = policy_of(name)
-    bench, random = Bench(cores_of(name), Rig.of_card(policy.card)), np.random.default_rng(5)
+    bench, random = Bench(cores_of(name), Rig.from_metadata(policy.metadata)), np.random.default_rng(5)
     records: list[list[bytes]] = [[], []]
     place, euler, seen = np.zeros(3), np.zeros(3), set()
     for step in range(900):

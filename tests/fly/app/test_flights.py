@@ -16,11 +16,11 @@ from mjxball.control import rotations
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly.app.protocol import AppPhase
-from mjxfly.card import Controller
+from mjxfly.policy_setup import FlightController
 from mjxfly.supervisor import FlightState as Laptop
 from mjxfly.twin import avionics
 from mjxfly.twin.conditions import FAULT_KINDS, Conditions, Surroundings, drone_kind
-from mjxfly.twin.virtual import VirtualTwin
+from virtual_twin import VirtualTwin
 
 
 def world(seconds: float = 6.0, curve: str = "linear", **around: Any) -> VirtualTwin:
@@ -66,7 +66,7 @@ def test_the_apps_land_without_a_laptop():
 def test_a_ball_at_either_end_is_lifted_and_kept(ball: float):
     """By the clock the law took over on the ground, and one of these never left it."""
     policy = Policy.load(shipped_policy("stand"))
-    config = Controller(policy).config
+    config = FlightController(policy).config
     conditions, most = replace(Conditions.of(config), ball=ball), config.plant.moving_fraction * config.plant.ball_stop
     cores = fly_faults_virtual.cores_of(shipped_policy("stand"), "float32")
     twin = VirtualTwin(policy, settings_of(policy, 8.0), conditions=conditions, settle=SETTLE, cores=cores)
@@ -95,9 +95,11 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away():
 def test_attitudes_that_disagree_are_not_taken_for_motors_that_do(monkeypatch: pytest.MonkeyPatch):
     """Each app found another difference, 15 and -15 %: both took the pair for lighter, and it sank to the ground."""
     rolls = [rotations.quaternion_from_euler(np.array([np.radians(roll), 0.0, 0.0])) for roll in (1.5, -1.5)]
-    true = avionics.Onboard._attitude
+    true = avionics.OnboardComputers._attitude
     monkeypatch.setattr(
-        avionics.Onboard, "_attitude", lambda own, drone: rotations.multiply_quaternions(true(own, drone), rolls[drone])
+        avionics.OnboardComputers,
+        "_attitude",
+        lambda own, drone: rotations.multiply_quaternions(true(own, drone), rolls[drone]),
     )
     twin = world(seconds=3.0)
     twin.fly_until(Laptop.FLY)

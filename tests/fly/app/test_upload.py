@@ -23,7 +23,7 @@ from mjxfly.app import generate, protocol
 from mjxfly.app.host import App, compile_pair
 from mjxfly.app.main import main as make_app
 from mjxfly.app.protocol import CAUSES, AppPhase
-from mjxfly.app_flight import Apps, send_weights
+from mjxfly.app_flight import OnboardApps, send_weights
 from mjxfly.connection import LinkError
 from mjxfly.limits import NAMES
 from mjxfly.main import main as fly
@@ -58,7 +58,7 @@ def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.
         assert text in error
     slow = policy_of("flight")
     with pytest.raises(InputError, match="control period of 40 ms"):
-        generate.files_of(dataclasses.replace(slow, card={**slow.card, "control_period": 0.04}), "slow", False)
+        generate.files_of(dataclasses.replace(slow, metadata={**slow.metadata, "control_period": 0.04}), "slow", False)
     assert not list(tmp_path.iterdir())
 
 
@@ -67,10 +67,10 @@ def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.
 def test_weights_are_uploaded_on_the_ground_only(name: str):
     policy = policy_of(name)
     other = dataclasses.replace(policy, biases=tuple(bias + np.float32(0.01) for bias in policy.biases))
-    bench = Bench(compile_pair(policy, name, int8=True), Rig.of_card(policy.card))
+    bench = Bench(compile_pair(policy, name, int8=True), Rig.from_metadata(policy.metadata))
     follower, key, data = bench.apps[1], generate.key_of(policy), weight_bytes(other)
     assert key == generate.key_of(other)
-    assert follower.ident == zlib.crc32(weight_bytes(policy)) == generate.ident_of(policy, True)
+    assert follower.ident == zlib.crc32(weight_bytes(policy)) == generate.weights_crc(policy, True)
 
     def upload(packets: Any) -> int:
         replies = [protocol.reply_of(follower.laptop(packet.data, bench.now)) for packet in packets]
@@ -83,14 +83,14 @@ def test_weights_are_uploaded_on_the_ground_only(name: str):
     assert upload([*packets[:7], *packets[8:]]) == bad  # a chunk is lost
     broken = [*packets[:7], packets[7]._replace(data=packets[7].data[:-1] + b"\x55"), *packets[8:]]
     assert upload(broken) == bad
-    assert follower.ident == generate.ident_of(policy, True)
+    assert follower.ident == generate.weights_crc(policy, True)
     for at, value in ((0, np.nan), (4, np.inf), (400, -3e38), (0, 2e6)):  # whole, and no numbers of a policy file
         wild = bytearray(data)
         wild[at : at + 4] = np.float32(value).tobytes()
         assert upload(protocol.upload(bytes(wild), key)) == bad
-    assert follower.ident == generate.ident_of(policy, True)
+    assert follower.ident == generate.weights_crc(policy, True)
     assert upload([*packets[:5], *packets[3:]]) == 0  # repeated ones do no harm
-    assert follower.ident == generate.ident_of(other, True)
+    assert follower.ident == generate.weights_crc(other, True)
     bench.take_off()
     flown = [bench.tick(AppPhase.FLY)[1] for _ in range(3)]
     new = Bench(compile_pair(other, name, int8=True), bench.rig)
@@ -122,7 +122,7 @@ def test_a_recurrent_policy_of_another_size_is_refused():
     for other in (benchmark.recurrent(47), benchmark.recurrent(64), policy_of("flight")):
         with pytest.raises(InputError, match=refusal):
             send_weights(AppLink(follower), weight_bytes(other), generate.key_of(other), print)  # type: ignore[arg-type]
-        assert follower.ident == generate.ident_of(policy, True)
+        assert follower.ident == generate.weights_crc(policy, True)
 
 
 class FakeLink:
@@ -139,7 +139,7 @@ class FakeLink:
 
 
 def test_the_laptop_refuses_other_apps():
-    apps, said = Apps("flight", (11, 12), 10), list[str]()
+    apps, said = OnboardApps("flight", (11, 12), 10), list[str]()
     good = ({"role": 0, "period": 10}, {"role": 1, "period": 10, "ident": 12})
 
     def check(*values: dict[str, float]) -> None:

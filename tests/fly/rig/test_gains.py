@@ -123,8 +123,8 @@ class TestResponse:
     def test_delivered_gains_diverge_and_these_do_not(self) -> None:
         trials = [Trial((8, 0, 0), lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
         stocked, designed = (
-            simulate(pair(PAIR), law, trials)[..., 0]
-            for law in (Autopilot(kind="crazyflie", motor_curve=PAIR.autopilot.motor_curve), PAIR.autopilot)
+            simulate(pair(PAIR), controller, trials)[..., 0]
+            for controller in (Autopilot(kind="crazyflie", motor_curve=PAIR.autopilot.motor_curve), PAIR.autopilot)
         )
         nominal = self.CORNERS.index((0.05, 1.0))
         assert stocked[:, nominal].max() > 1.7 * 8  # and swings on: below
@@ -140,7 +140,9 @@ class TestResponse:
         moment = (0.5 * 0.0075 * 9.81 * 0.08, 0.0, 0.0)
         steps = [Trial((8, 0, 0), lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
         loads = [Trial(torque=moment, lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
-        before, now = (simulate(pair(PAIR), law, steps + loads)[..., 0] for law in (INTERIM, PAIR.autopilot))
+        before, now = (
+            simulate(pair(PAIR), controller, steps + loads)[..., 0] for controller in (INTERIM, PAIR.autopilot)
+        )
         count = len(self.CORNERS)
         assert (now[:, :count].max(axis=0) <= before[:, :count].max(axis=0) + 0.01).all()
         assert (now[:, count:].max(axis=0) < 0.75 * before[:, count:].max(axis=0)).all()

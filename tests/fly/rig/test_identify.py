@@ -156,7 +156,7 @@ def test_clocks_that_differ_are_refused(brief) -> None:
 def test_rows_that_hold_nothing_are_missing(brief, tmp_path: Path) -> None:
     """40 rows of the follower's states in an .npz, and 3 times of its rows."""
     states, time = brief["states"].copy(), brief["time"].copy()
-    whole = make_log(time, states=[states[:, 0], states[:, 1]], setpoints=brief["setpoints"], seen_at=time)
+    whole = make_log(time, states=[states[:, 0], states[:, 1]], setpoints=brief["setpoints"], measured_at=time)
     for number, nothing in enumerate((np.nan, np.inf, 0.0)):
         states[200:240, 1] = nothing
         np.savez(tmp_path / f"{number}.npz", **{**brief, "states": states})
@@ -254,9 +254,9 @@ class TestCommand:
 
     @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
     def test_a_gain_file_says_how_much_the_follower_integrates(self, tmp_path: Path, share: float) -> None:
-        law = dataclasses.replace(PAIR.autopilot, follower_ki_scale=share)
-        (tmp_path / "gains.json").write_text(parameter_file(law))
-        assert command.with_gains(PAIR, read_gains(tmp_path / "gains.json")).autopilot == law
+        controller = dataclasses.replace(PAIR.autopilot, follower_ki_scale=share)
+        (tmp_path / "gains.json").write_text(parameter_file(controller))
+        assert command.with_gains(PAIR, read_gains(tmp_path / "gains.json")).autopilot == controller
 
     @pytest.mark.parametrize(
         "follower", [{"pid_rate.roll_kp": 500.0}, {"pid_rate.pitch_ki": 500.0}, {"pid_rate.yaw_ki": 1e9}]

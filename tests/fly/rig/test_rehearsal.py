@@ -20,7 +20,7 @@ from mjxball.config import Config
 from mjxball.control.axes import inertia_about_o
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
-from mjxfly import card
+from mjxfly import policy_setup
 from mjxfly.flight_log import Journal, read
 from mjxfly.limits import NAMES, FlightSettings
 from mjxfly.recording import load
@@ -32,10 +32,10 @@ from mjxfly.supervisor import FlightState
 from mjxfly.twin import conditions as kinds
 from mjxfly.twin.conditions import Conditions
 from mjxfly.twin.coupled import CoupledPair
-from mjxfly.twin.virtual import STEP
+from virtual_twin import STEP
 
 CONTENTS = load_file(shipped_policy("flight"))
-CONFIG = card.config_of(CONTENTS.card)
+CONFIG = policy_setup.config_of(CONTENTS.metadata)
 REACH = np.array([0.1, 0.4, 0.2])  # of the goals from the first one [m]
 pytestmark = pytest.mark.slow
 
@@ -187,7 +187,7 @@ def test_from_the_runners_log_to_a_plant_file(logs: dict[str, Path], tmp_path: P
     assert "older force curve" in captured.out
     assert "all 2 logs" in captured.out
     rig, wanted = cli.apply_plant(configs.preset("flight"), out), truth(CASES[name])
-    flown = card.with_curve(configs.preset("flight"), "older")
+    flown = policy_setup.with_curve(configs.preset("flight"), "older")
     # As the docs say of drones with sensors: 0.5 % of the force, 8 % of the inertia, 20 % of the lag, 5 ms of delay.
     np.testing.assert_allclose(rig.autopilot.motor_curve, wanted[0] * np.array(flown.autopilot.motor_curve), rtol=0.005)
     assert inertia_about_o(rig)[0] == pytest.approx(wanted[1], rel=0.08)
@@ -378,7 +378,7 @@ def test_the_rig_and_the_gains_are_the_logs(logs: dict[str, Path], capsys: Any) 
     assert "say --preset flight" in errors
     log: Log = read_log(path)
     other = configs.apply_overrides(CONFIG, {"autopilot.roll_rate": (500.0, 0.0, 0.0)})
-    flown = card.with_curve(CONFIG, "linear").autopilot.roll_rate
+    flown = policy_setup.with_curve(CONFIG, "linear").autopilot.roll_rate
     assert command.flown_with(other, log, None, path).autopilot.roll_rate == pytest.approx(flown)
     given = command.flown_with(other, log, ({"pid_rate.roll_kp": 400.0},) * 2, path).autopilot.roll_rate
-    assert given == (400.0, *card.with_curve(other, "linear").autopilot.roll_rate[1:])
+    assert given == (400.0, *policy_setup.with_curve(other, "linear").autopilot.roll_rate[1:])

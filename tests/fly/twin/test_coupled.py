@@ -145,7 +145,7 @@ def test_each_drone_has_gains_of_its_own() -> None:
     np.testing.assert_allclose(run(shared, (4, 2, 5, 47000), 0.5).position, run(apart, (4, 2, 5, 47000), 0.5).position)
     one.set_parameter(0, "pid_rate.roll_kp", 100.0)
     assert not one.onboard._alike
-    assert [law.roll_rate[0] for law in one.onboard._autopilots] == [100.0, config.autopilot.roll_rate[0]]
+    assert [controller.roll_rate[0] for controller in one.onboard._autopilots] == [100.0, config.autopilot.roll_rate[0]]
 
 
 def test_gains_by_name() -> None:

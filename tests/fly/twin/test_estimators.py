@@ -16,7 +16,7 @@ from mjxfly.twin.conditions import DELIVERED, Battery, Conditions, DroneKind, Su
 from mjxfly.twin.coupled import CoupledPair
 from mjxfly.twin.drone import TwinDrone
 from mjxfly.twin.estimators import Imu
-from mjxfly.twin.pair import Modes, PairState
+from mjxfly.twin.pair import PairState, SupervisorOutputs
 from mjxfly.twin.protocol import header
 
 TICK = 0.005  # [s]
@@ -240,7 +240,7 @@ def test_a_stabilizer_that_hangs_holds_pwm_and_estimate() -> None:
     before = hover(pair, RISING, 1.0).report
     rows = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, RISING]])
     for _ in range(20):
-        state = pair.advance(rows, TICK, Modes(held=(True, False)))
+        state = pair.advance(rows, TICK, SupervisorOutputs(held=(True, False)))
     np.testing.assert_array_equal(state.report.pwm[0], before.pwm[0])
     np.testing.assert_array_equal(state.report.position[0], before.position[0])
     assert (state.report.position[1] != before.position[1]).any()

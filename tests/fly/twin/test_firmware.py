@@ -26,7 +26,7 @@ from mjxfly.twin.conditions import (
 from mjxfly.twin.drone import TwinDrone, advance
 from mjxfly.twin.firmware import BOOT_TIME, Firmware, Motors, Order
 from mjxfly.twin.parameters import PARAMETERS
-from mjxfly.twin.physics import StandIn
+from mjxfly.twin.physics import SimplePair
 from mjxfly.twin.protocol import Peer, header
 
 BRUSHLESS = DRONES["brushless"]
@@ -355,8 +355,8 @@ def test_numbers_that_are_not_finite_never_reach_the_physics() -> None:
 # Row: stabilizer task dead, and the other faults of a drone.
 
 
-def flown(kind: DroneKind = DELIVERED) -> tuple[StandIn, tuple[TwinDrone, TwinDrone], list[float]]:
-    pair = StandIn(kind=kind)
+def flown(kind: DroneKind = DELIVERED) -> tuple[SimplePair, tuple[TwinDrone, TwinDrone], list[float]]:
+    pair = SimplePair(kind=kind)
     return pair, (TwinDrone(pair, 0), TwinDrone(pair, 1)), [0.0]
 
 
@@ -470,7 +470,7 @@ def test_parameters_that_cannot_be_written() -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.005, 0.0125])
 def test_row_round_trips_hold_from_the_first_packet(delay: float) -> None:
-    pair = StandIn(surroundings=Surroundings(delay=delay))
+    pair = SimplePair(surroundings=Surroundings(delay=delay))
     drone = TwinDrone(pair, 0)
     drone.receive(b"\xfd\x00", 1.0)
     arrived = []

@@ -13,7 +13,7 @@ from mjxball import config as configs
 from mjxball.policy import shipped_policy
 from mjxfly.main import main
 from mjxfly.twin.conditions import AddedLoad, Surroundings
-from mjxfly.twin.coupled import CoupledPair, grounded_model, put_on
+from mjxfly.twin.coupled import CoupledPair, attach_load, grounded_model
 
 REFUSALS = [
     (TRANSPORT, "0.004 0.05 5", "trained on Crazyflies"),
@@ -49,7 +49,7 @@ def test_the_twin_carries_the_load_where_it_was_put() -> None:
     settings = configs.preset("flight")
     model = grounded_model(settings, settings.plant.object_mass)
     before = inertia_about_o(model)
-    put_on(model, settings.plant, 0.006, -0.05)
+    attach_load(model, settings.plant, 0.006, -0.05)
     mass, moment, inertia = (new - old for new, old in zip(inertia_about_o(model), before, strict=True))
     assert mass == pytest.approx(0.006, rel=1e-9)
     np.testing.assert_allclose(moment, [0.0, -0.006 * 0.05, 0.0], atol=1e-12)

@@ -14,7 +14,7 @@ ASKED = "--twin-drone brushless --twin-curve older --twin-noise 3 --twin-pose-hz
 ASKED += " --twin-gains 0.95 1.05 --twin-seed 7"
 
 
-def twin_of(flags: list[str]) -> argparse.Namespace:
+def drone_kind_of(flags: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     add_twin_options(parser)
     return parser.parse_args(flags)
@@ -23,12 +23,12 @@ def twin_of(flags: list[str]) -> argparse.Namespace:
 def test_the_runner_hands_on_what_it_was_asked() -> None:
     options = make_parser().parse_args(["policy.npz", "--rehearse", *ASKED.split()])
     check_twin_options(options)
-    told = twin_of(twin_options(options))
+    told = drone_kind_of(twin_options(options))
     assert surroundings(told) == Surroundings(3.0, 20.0, False, 0.01, (0.95, 1.05), seed=7)
     assert (told.twin_drone, told.twin_curve) == ("brushless", "older")
     nothing = make_parser().parse_args(["policy.npz", "--rehearse"])
     assert twin_options(nothing) == []
-    assert surroundings(twin_of([])) == Surroundings()
+    assert surroundings(drone_kind_of([])) == Surroundings()
 
 
 @pytest.mark.parametrize(

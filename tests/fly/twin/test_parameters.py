@@ -10,6 +10,7 @@ import pytest
 from onboard_bench import cores_of, needs_gcc
 from twin_peer import written
 
+import virtual_twin as virtual
 from fly_faults_virtual import SETTLE, settings_of
 from mjxball import config as configs
 from mjxball.errors import InputError
@@ -22,14 +23,13 @@ from mjxfly.connection import LinkError
 from mjxfly.link import Link
 from mjxfly.main import main as fly
 from mjxfly.mocap import Mocap, MocapSettings
-from mjxfly.twin import virtual
 from mjxfly.twin.conditions import DELIVERED, DRONES, FAULT_KINDS, POSITIONING, BodyFault, Conditions, Surroundings
 from mjxfly.twin.coupled import CoupledPair
 from mjxfly.twin.drone import ACTED, TwinDrone, only_kept
 from mjxfly.twin.firmware import Motors
 from mjxfly.twin.logs import GROUPS, LOG_VARIABLES
 from mjxfly.twin.parameters import OF_APP, PARAMETERS
-from mjxfly.twin.virtual import VirtualTwin
+from virtual_twin import VirtualTwin
 
 
 def drone_with(kind: Any = DELIVERED, **around: Any) -> TwinDrone:

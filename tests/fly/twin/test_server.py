@@ -16,9 +16,9 @@ from mjxfly import packets
 from mjxfly.packets import Setpoint
 from mjxfly.process import wait_until
 from mjxfly.twin import logs, protocol
-from mjxfly.twin.pair import RUNNING, Modes, PairState
+from mjxfly.twin.pair import RUNNING, PairState, SupervisorOutputs
 from mjxfly.twin.parameters import PARAMETERS
-from mjxfly.twin.physics import StandIn
+from mjxfly.twin.physics import SimplePair
 from mjxfly.twin.server import HOST, MOST_BEHIND, Twin
 
 cflib = pytest.importorskip("cflib")
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.clock  # by the clock
 LIMIT = 10.0  # [s] that an answer may take on a busy machine
 
 
-class Told(StandIn):
+class GivenRotor(SimplePair):
     """The stand-in, and what it was told."""
 
     def __init__(self) -> None:
@@ -37,20 +37,20 @@ class Told(StandIn):
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         self.parameters.append((drone, name, value))
 
-    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+    def advance(self, setpoints: np.ndarray, dt: float, modes: SupervisorOutputs = RUNNING) -> PairState:
         self.setpoints = setpoints
         return super().advance(setpoints, dt, modes)
 
 
 @pytest.fixture(scope="module")
-def flown() -> Iterator[tuple[Twin, Told, Any]]:
+def flown() -> Iterator[tuple[Twin, GivenRotor, Any]]:
     """A twin, its physics, and cflib connected to the leader."""
     import cflib.crtp
     from cflib.crazyflie import Crazyflie
 
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()
-    physics = Told()
+    physics = GivenRotor()
     with Twin(physics) as twin:
         crazyflie, ready = Crazyflie(), threading.Event()
         crazyflie.fully_connected.add_callback(lambda uri: ready.set())
@@ -61,7 +61,7 @@ def flown() -> Iterator[tuple[Twin, Told, Any]]:
     assert twin.failure is None
 
 
-def test_cflib_finds_every_table_entry(flown: tuple[Twin, Told, Any]) -> None:
+def test_cflib_finds_every_table_entry(flown: tuple[Twin, GivenRotor, Any]) -> None:
     crazyflie = flown[2]
     assert crazyflie.platform.get_protocol_version() == 12
     for name, kind in logs.LOG_VARIABLES:
@@ -75,7 +75,7 @@ def test_cflib_finds_every_table_entry(flown: tuple[Twin, Told, Any]) -> None:
         assert float(crazyflie.param.get_value(parameter.name)) == pytest.approx(booted[parameter.name], rel=1e-6)
 
 
-def test_a_parameter_is_written_read_back_and_reaches_the_physics(flown: tuple[Twin, Told, Any]) -> None:
+def test_a_parameter_is_written_read_back_and_reaches_the_physics(flown: tuple[Twin, GivenRotor, Any]) -> None:
     _, physics, crazyflie = flown
     crazyflie.param.set_value("pid_attitude.roll_kp", 4.5)
     assert wait_until(lambda: crazyflie.param.get_value("pid_attitude.roll_kp") == "4.5", LIMIT)
@@ -86,7 +86,7 @@ def test_a_parameter_is_written_read_back_and_reaches_the_physics(flown: tuple[T
     assert defaults == [6.0]
 
 
-def test_all_of_a_state_comes_in_one_packet_at_100_hz(flown: tuple[Twin, Told, Any]) -> None:
+def test_all_of_a_state_comes_in_one_packet_at_100_hz(flown: tuple[Twin, GivenRotor, Any]) -> None:
     from cflib.crazyflie.log import LogConfig
 
     _, _, crazyflie = flown
@@ -106,7 +106,7 @@ def test_all_of_a_state_comes_in_one_packet_at_100_hz(flown: tuple[Twin, Told, A
     assert seen[-1][1]["supervisor.info"] & packets.CAN_FLY
 
 
-def test_setpoints_and_supervisor(flown: tuple[Twin, Told, Any]) -> None:
+def test_setpoints_and_supervisor(flown: tuple[Twin, GivenRotor, Any]) -> None:
     twin, physics, crazyflie = flown
     crazyflie.commander.send_setpoint(0, 0, 0, 0)
     crazyflie.commander.send_setpoint(1.0, 2.0, 3.0, 12000)
@@ -122,7 +122,7 @@ def test_setpoints_and_supervisor(flown: tuple[Twin, Told, Any]) -> None:
     assert not twin.truth.info[1] & packets.LOCKED
 
 
-def test_a_scan_is_answered(flown: tuple[Twin, Told, Any]) -> None:
+def test_a_scan_is_answered(flown: tuple[Twin, GivenRotor, Any]) -> None:
     port = int(flown[0].uris[1].rsplit(":", 1)[1])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.settimeout(2)
@@ -135,7 +135,7 @@ def test_a_scan_is_answered(flown: tuple[Twin, Told, Any]) -> None:
     [((8, 0, 0), 1, -1), ((0, -8, 0), 0, +1)],  # crazyflie.md: +8 roll moves toward -y, +8 pitch toward +x
 )
 def test_tilts_move_the_way_a_crazyflie_moves(wire: tuple[float, float, float], axis: int, sign: int) -> None:
-    pair = StandIn()
+    pair = SimplePair()
     row = Setpoint(*wire, round(pair.plant.curve.thrust(pair.plant.mass * 9.81 / 2)) + 3000)
     for _ in range(200):
         state = pair.advance(np.array([row, row], float), 0.005)
@@ -145,7 +145,7 @@ def test_tilts_move_the_way_a_crazyflie_moves(wire: tuple[float, float, float], 
 
 
 def test_a_positive_yaw_rate_turns_clockwise() -> None:
-    pair = StandIn()
+    pair = SimplePair()
     row = Setpoint(0, 0, 40.0, round(pair.plant.curve.thrust(pair.plant.mass * 9.81 / 2)) + 3000)
     for _ in range(200):
         state = pair.advance(np.array([row, row], float), 0.005)
@@ -153,7 +153,7 @@ def test_a_positive_yaw_rate_turns_clockwise() -> None:
 
 
 def test_the_stick_is_rigid_and_what_falls_falls() -> None:
-    pair = StandIn()
+    pair = SimplePair()
     for number in range(400):
         thrust = 50000 if number < 200 else 0
         row = Setpoint(5.0, 3.0, 20.0, thrust)
@@ -164,10 +164,10 @@ def test_the_stick_is_rigid_and_what_falls_falls() -> None:
     assert state.velocity[0, 2] < 0 or state.position[:, 2].max() < 0.01
 
 
-class Slow(Told):
+class Slow(GivenRotor):
     """Physics of which 5 ms take longer."""
 
-    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+    def advance(self, setpoints: np.ndarray, dt: float, modes: SupervisorOutputs = RUNNING) -> PairState:
         time.sleep(0.02)
         return super().advance(setpoints, dt, modes)
 

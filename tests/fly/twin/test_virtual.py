@@ -12,11 +12,11 @@ from mjxball import config as configs
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxfly import packets
-from mjxfly.card import Controller, goal_of, variants
 from mjxfly.limits import FlightSettings
+from mjxfly.policy_setup import FlightController, goal_of, variants
 from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
-from mjxfly.twin.virtual import VirtualTwin
+from virtual_twin import VirtualTwin
 
 pytest.importorskip("mujoco")
 
@@ -26,7 +26,7 @@ def policy_of(preset: str) -> Policy:
 
 
 def settings_of(policy: Policy, seconds: float) -> FlightSettings:
-    return FlightSettings(seconds=seconds, goal=goal_of(Controller(policy).config))
+    return FlightSettings(seconds=seconds, goal=goal_of(FlightController(policy).config))
 
 
 def zeros(world: VirtualTwin, seconds: float) -> None:
@@ -80,7 +80,7 @@ def test_a_pair_that_locked_itself_is_refused() -> None:
 
 def test_maps_convert_a_cards_hover_to_the_drones_curve() -> None:
     """firmware.md: the stand's 46 000 of the older curve is 50 562 of the linear one."""
-    leader, _ = variants(Controller(policy_of("stand")).config)
+    leader, _ = variants(FlightController(policy_of("stand")).config)
     older, linear = leader["older"].map, leader["linear"].map
     assert older.hover == pytest.approx(46000, abs=3)  # 50 568 is rounded
     force = older.curve.force(older.hover)

@@ -45,7 +45,7 @@ def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
-        world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.card), log=notes)
+        world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.metadata), log=notes)
         world.fly_until(FlightState.DONE)
         notes.note("end", code=0)
     return path.read_bytes().splitlines(keepends=True)

@@ -9,16 +9,16 @@ import numpy as np
 from euler_angles import matrix_from_euler
 from tables import rows
 
-from mjxball.baselines import LAWS as FOLLOWERS
-from mjxball.baselines import make_law
+from mjxball.baselines import CONTROLLERS as FOLLOWERS
+from mjxball.baselines import make_controller
 from mjxball.config import Autopilot, preset
 from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
-from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.follower_controller import FollowerController
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.geometry import ring_geometry
 from mjxball.control.observation import ObservationHistory
 from mjxball.plant import AttitudeGains
-from mjxball.sim.follower import follower_law
+from mjxball.sim.follower import follower_controller
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -38,8 +38,8 @@ KP, KD, KI = (0.5, 0.4, 0.3), (1.0, 0.9, 0.8), (0.1, 0.0, 0.2)
 GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
 MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
-RECURRENT = follower_law(preset("team"))
-TOLD, STATE = random.uniform(1, 3, (WORLDS, 4)), random.uniform(-1, 1, (WORLDS, RECURRENT.units))
+RECURRENT = follower_controller(preset("team"))
+GIVEN, STATE = random.uniform(1, 3, (WORLDS, 4)), random.uniform(-1, 1, (WORLDS, RECURRENT.units))
 KEPT = 0.1 * normal(RECURRENT.size)
 HISTORY = ObservationHistory(previous_action=True, filters=(0.1, 0.5))
 SEEN, MEMORY, ACTION = normal(18), normal(HISTORY.size), random.uniform(-1, 1, (WORLDS, 3))
@@ -52,12 +52,12 @@ CALM = {"mpc": 0.05 * FLIGHT}  # where no limit is met: programs are solved to a
 
 def flown(name: str, plant: str = "paper") -> Callable[..., Any]:
     """The commands (WORLDS, 2, 3) of a classical follower of the preset `plant` that is shown `FLIGHT`."""
-    law = make_law(name, preset(plant))
+    controller = make_controller(name, preset(plant))
 
     def commands(flight: Any, *privileged: Any) -> Any:
-        memory, given = law.start(flight[..., 0, :]), []
+        memory, given = controller.start(flight[..., 0, :]), []
         for step in range(2):
-            memory, command = law.step(memory, flight[..., step, :], PrivilegedInfo(*privileged))
+            memory, command = controller.step(memory, flight[..., step, :], PrivilegedInfo(*privileged))
             given.append(command)
         return flight.__array_namespace__().stack(given, axis=-2)
 
@@ -73,7 +73,7 @@ CASCADE = (
 )
 
 # name -> (law of arrays alone, its arrays). Clipping happens in some worlds and not in others.
-LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
+CONTROLLERS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.rotate": (rotations.rotate, (MATRIX, normal(3))),
     "rotations.rotate_back": (rotations.rotate_back, (MATRIX, normal(3))),
     "rotations.cross": (rotations.cross, (normal(3), normal(3))),
@@ -124,13 +124,13 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "history.next": (HISTORY.next, (MEMORY, SEEN, ACTION)),
     "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
     "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
-    "follower_law.command": (
-        lambda a, s: FollowerLaw(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s),
+    "follower_controller.command": (
+        lambda a, s: FollowerController(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s),
         (ACTION, 3 * SEEN),
     ),
-    "follower_law.start": (RECURRENT.start, (SEEN, TOLD)),
-    "follower_law.next": (RECURRENT.next, (KEPT, SEEN, np.concatenate([ACTION, STATE], axis=-1))),
-    "follower_law.network_input": (RECURRENT.network_input, (SEEN, KEPT)),
+    "follower_controller.start": (RECURRENT.start, (SEEN, GIVEN)),
+    "follower_controller.next": (RECURRENT.next, (KEPT, SEEN, np.concatenate([ACTION, STATE], axis=-1))),
+    "follower_controller.network_input": (RECURRENT.network_input, (SEEN, KEPT)),
     "geometry.ring_geometry": (ring_geometry, (np.arange(WORLDS) % 5 + 2.0, normal(2))),
     **{f"baseline {name}": (flown(name), (CALM.get(name, FLIGHT), *PRIVILEGED)) for name in FOLLOWERS},
     **{
@@ -139,7 +139,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     },
 }
 # Computed once in NumPy float64, from the config, not from arrays.
-NOT_LAWS = {
+NOT_CONTROLLERS = {
     "mixer.torque_per_force",
     "crazyflie.unpack",
     "crazyflie.cascade",
@@ -153,7 +153,7 @@ NOT_LAWS = {
         for name in ("gains_of", "pair_gains", "read_pair_gains", "gains_to_json", "with_gains", "with_stock_gains")
     ),
 }
-each_law = rows("name", LAWS)
+each_controller = rows("name", CONTROLLERS)
 
 
 def difference(first: Any, second: Any) -> float:
@@ -170,38 +170,38 @@ def test_every_law_is_compared():
         for name, member in inspect.getmembers(module, inspect.isfunction)
         if member.__module__ == module.__name__ and not name.startswith("_")
     }
-    assert public - set(LAWS) == NOT_LAWS
+    assert public - set(CONTROLLERS) == NOT_CONTROLLERS
 
 
-@each_law
+@each_controller
 def test_float64_agrees(name):
-    law, arrays = LAWS[name]
-    expected = law(*arrays)
+    controller, arrays = CONTROLLERS[name]
+    expected = controller(*arrays)
     with jax.enable_x64(True):
-        result = jax.jit(law)(*map(jax.numpy.asarray, arrays))
+        result = jax.jit(controller)(*map(jax.numpy.asarray, arrays))
         assert result.dtype == np.float64
     # Both round to 1e-16; sin and cos of the two libraries differ by an ulp; a call back answers in float32.
     assert difference(result, expected) < (1e-6 if name == "baseline mpc" else 1e-10)
 
 
-@each_law
+@each_controller
 def test_float32_agrees(name):
-    law, arrays = LAWS[name]
+    controller, arrays = CONTROLLERS[name]
     single = [array.astype(np.float32) for array in arrays]
-    on_numpy = law(*single)
-    on_jax = jax.jit(law)(*map(jax.numpy.asarray, single))
+    on_numpy = controller(*single)
+    on_jax = jax.jit(controller)(*map(jax.numpy.asarray, single))
     assert on_numpy.dtype == on_jax.dtype == np.float32
     # float32 rounding, about 1e-5 of full scale; motors' and thrust's commands are whole numbers, of which rounding may
     # move one by 2.
     tolerance = 2.5 / 65535 if name in ("crazyflie.cascade motors", "crazyflie.setpoints") else 1e-5
     assert difference(on_jax, on_numpy) < tolerance
-    assert difference(on_numpy, law(*arrays)) < tolerance
+    assert difference(on_numpy, controller(*arrays)) < tolerance
 
 
-@each_law
+@each_controller
 def test_batch_equals_single(name):
-    law, arrays = LAWS[name]
-    batched = law(*arrays)
-    single = law(*(array[5] if len(array) == WORLDS else array for array in arrays))
+    controller, arrays = CONTROLLERS[name]
+    batched = controller(*arrays)
+    single = controller(*(array[5] if len(array) == WORLDS else array for array in arrays))
     # The same operations in the same order, but NumPy's vectorised sine may differ by an ulp.
     np.testing.assert_allclose(batched[5], single, rtol=1e-14, atol=1e-15)

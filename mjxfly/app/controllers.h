@@ -1,6 +1,6 @@
 /* Controllers of pair drone: its estimate of the pair, the leader's PID, the follower's network. Part of core.c. */
-#ifndef MJXBALL_LAWS_H
-#define MJXBALL_LAWS_H
+#ifndef MJXBALL_CONTROLLERS_H
+#define MJXBALL_CONTROLLERS_H
 
 #include "core.h"
 

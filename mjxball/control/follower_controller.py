@@ -26,7 +26,7 @@ NEAR_ERROR, NEAR_ERROR_RATE = 0.03, 0.1  # [m], [m/s]
 SATURATED = 6  # such numbers
 
 
-class FollowerLaw(NamedTuple):
+class FollowerController(NamedTuple):
     """What is around the network of one follower.
 
     Its memory (..., m) holds that of `history`, the state of the network's GRU, and what it was told of its team.

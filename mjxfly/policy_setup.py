@@ -16,7 +16,7 @@ from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.policy import Policy, PolicyFile, load_file, team
-from mjxball.sim.laws import Body, Laws
+from mjxball.sim.controllers import Body, Controllers
 from mjxfly.limits import Limits, Times
 from mjxfly.setpoints import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxfly.telemetry import Rig
@@ -30,28 +30,28 @@ UNKNOWN_MASS = 0.07  # total mass if the policy's plant is not a pair of Crazyfl
 def load_policy(path: Path) -> PolicyFile:
     """The policy in the file `path`; one trained for any rig is given a pair of Crazyflies. Raises PolicyFileError."""
     contents = load_file(path)
-    if not team.is_for_any(contents.card):
+    if not team.is_for_any(contents.metadata):
         return contents
     return team.in_team(contents, path.stem, plant_setup(team.CRAZYFLIES))
 
 
-def config_of(card: Mapping[str, Any]) -> Config:
+def config_of(metadata: Mapping[str, Any]) -> Config:
     """The configuration that a policy was trained with; settings that an older file lacks have their defaults.
 
     Raises InputError for an invalid configuration.
     """
-    data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
-    data["plant"] = {**data["plant"], **card["plant"]}
-    tilt, vertical = card["command_limits"]
-    data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"]}
+    data = configs.to_dict(configs.from_record({"plant": {}, **metadata.get("config", {})}))
+    data["plant"] = {**data["plant"], **metadata["plant"]}
+    tilt, vertical = metadata["command_limits"]
+    data["leader"] |= {"kp": metadata["leader_kp"], "kd": metadata["leader_kd"]}
     data["command"] |= {"tilt_limit": tilt, "vertical_limit": vertical}
-    data["timing"] |= {"control_period": card["control_period"]}
+    data["timing"] |= {"control_period": metadata["control_period"]}
     return configs.validate(configs.from_record(data))
 
 
-def mount_angle(card: Mapping[str, Any]) -> float:
+def mount_angle(metadata: Mapping[str, Any]) -> float:
     """Angle [rad] about body z from the object's axes to those in which the policy sees and commands, see `team`."""
-    return float(card.get("team", {}).get("mount_angle", 0.0))
+    return float(metadata.get("team", {}).get("mount_angle", 0.0))
 
 
 def is_crazyflie(config: Config) -> bool:
@@ -84,10 +84,10 @@ def limits_of(config: Config, goal: Sequence[float], battery: float | None = Non
 
 
 @dataclass(frozen=True)
-class ThrustChoice:
+class ThrustOptions:
     """Thrust settings of the command line; None: as in the policy's configuration."""
 
-    law: Literal["paper", "calibrated"] | None = None
+    thrust_model: Literal["paper", "calibrated"] | None = None
     hover: float | None = None  # [thrust units]
     curve: CurveName | None = None
     mass: float | None = None  # total mass of drones and object [kg]
@@ -116,7 +116,7 @@ def with_curve(config: Config, name: CurveName) -> Config:
     return motors.with_curve(config, (curve.quadratic, curve.linear))
 
 
-def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGains = ({}, {})) -> list[Variants]:
+def variants(config: Config, choice: ThrustOptions = ThrustOptions(), more: PairGains = ({}, {})) -> list[Variants]:
     """Command map and gains of leader and follower for each force curve that their firmware may have.
 
     `choice.curve` selects one curve. `more` gains override those of the policy, for every curve.
@@ -133,14 +133,14 @@ def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGa
     return list(found)
 
 
-def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple[CommandMap, CommandMap]:
+def command_maps(config: Config, choice: ThrustOptions = ThrustOptions()) -> tuple[CommandMap, CommandMap]:
     """Command maps of leader and follower: each carries itself and its share of the object's mass, as in simulation."""
     plant, autopilot = config.plant, config.autopilot
     known = is_crazyflie(config)
     shares = Rig.of_plant(plant).weights
     curve = ForceCurve(*autopilot.motor_curve) if known else curve_of(config, choice.curve or "linear")
     hover = autopilot.hover_thrust if choice.hover is None else choice.hover
-    law = choice.law or (autopilot.thrust_law if known else "calibrated")
+    thrust_model = choice.thrust_model or (autopilot.thrust_law if known else "calibrated")
     own = plant.known_masses
     carried = [mass + share * plant.object_mass for mass, share in zip(own, shares, strict=True)]
     if choice.mass is not None or not known:
@@ -148,7 +148,9 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
         # The total is given or guessed: scale all masses by one factor.
         carried = [mass * whole / sum(carried) for mass in carried] if known else [share * whole for share in shares]
     per_acceleration = autopilot.thrust_per_acceleration
-    leader, follower = (CommandMap(law, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried)
+    leader, follower = (
+        CommandMap(thrust_model, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried
+    )
     return leader, follower
 
 
@@ -161,13 +163,13 @@ class PairCommands(NamedTuple):
     hidden: np.ndarray | None = None  # (H,) state of its GRU after the step; None: no GRU
 
 
-class Controller:
+class FlightController:
     """Leader PID and follower policy, with the gains, limits and control period of the policy's configuration."""
 
     def __init__(self, policy: Policy):
-        config = config_of(policy.card)
+        config = config_of(policy.metadata)
         self.policy, self.config, self.period = policy, config, policy.control_period
-        self._loop, self._angle = Laws(config), mount_angle(policy.card)
+        self._loop, self._angle = Controllers(config), mount_angle(policy.metadata)
         self.reset()
 
     def reset(self) -> None:
@@ -177,7 +179,7 @@ class Controller:
 
     @property
     def integral(self) -> np.ndarray:
-        """Integrals of both controllers, see `sim.laws.Laws`."""
+        """Integrals of both controllers, see `sim.controllers.Controllers`."""
         return self._integral
 
     def step(self, state: Body, goal: np.ndarray) -> PairCommands:

@@ -20,11 +20,11 @@ from mjxball.policy import Policy
 from mjxfly import app_flight, packets, positioning
 from mjxfly.app.host import Library
 from mjxfly.app.protocol import APP_VARIABLES, sample_of
-from mjxfly.card import Controller, motor_of, times_of, variants
 from mjxfly.flight import Flight
 from mjxfly.limits import NAMES, FlightSettings
 from mjxfly.monitor import down_reason
 from mjxfly.packets import Packet
+from mjxfly.policy_setup import FlightController, motor_of, times_of, variants
 from mjxfly.preflight import parameters_of
 from mjxfly.setpoints import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxfly.supervisor import FlightState, Supervisor
@@ -139,7 +139,7 @@ class MemoryLog:
         return [record["after"] for record in self.records if record["kind"] == "transition"]
 
 
-class Moment(NamedTuple):
+class TrueState(NamedTuple):
     """True state at one time."""
 
     time: float  # [s]
@@ -177,8 +177,8 @@ class VirtualTwin:
         `flight_log.Journal`. With `checks`, a drone that cannot fly refuses the flight, as before a real flight.
         `cores`: compiled apps of both drones, which then control the flight, see `app.host`.
         """
-        self.policy, self.rig, self._checks = policy, Rig.of_card(policy.card), checks
-        self.config = Controller(policy).config
+        self.policy, self.rig, self._checks = policy, Rig.from_metadata(policy.metadata), checks
+        self.config = FlightController(policy).config
         self.pair: Pair = physics or pair_of(self.config, kind, surroundings, conditions)
         self.state: PairState = self.pair.start()
         self.rest = float(self.state.position[:, 2].mean())
@@ -199,13 +199,13 @@ class VirtualTwin:
         if self._onboard:
             self.settings = app_flight.settings_of(self.settings)
             self.variants = app_flight.variants_of(self.variants, self.rig, self.settings)
-        self.track: list[Moment] = []
+        self.track: list[TrueState] = []
         self._start_flight(settle)
 
     def _start_flight(self, settle: float) -> None:
         """Prepare the drones, wait `settle` [s], begin a flight; with `checks` it is ready only if both can fly."""
         curve: CurveName = "linear" if "linear" in self.variants[0] else "older"
-        controller, curves = Controller(self.policy), [curve, curve]
+        controller, curves = FlightController(self.policy), [curve, curve]
         kind = app_flight.OnboardFlight if self._onboard else Flight
         self.flight = kind(self.links, controller, self.variants, curves, self.rig, self.settings, self.log.note)
         for link, own in zip(self.links, self.variants, strict=True):
@@ -282,11 +282,11 @@ class VirtualTwin:
 
     # True state.
 
-    def moment(self) -> Moment:
+    def moment(self) -> TrueState:
         """Return the true state now."""
         state = self.state
         line = state.position[0] - state.position[1]
-        return Moment(
+        return TrueState(
             time=self.now,
             state=self.flight.supervisor.state.value,
             position=state.position.mean(axis=0),

@@ -58,7 +58,7 @@ class Body(Protocol):
         """About the body axes [rad/s]."""
 
 
-class Laws:
+class Controllers:
     """Laws of all drones for one configuration, on arrays of any batch shape and namespace.
 
     Of several followers, F = N - 1, observations are (..., F, 18) and commands (..., F, 3), in the order of
@@ -78,7 +78,7 @@ class Laws:
     """
 
     def __init__(self, config: Config, parameters: PlantParameters | None = None):
-        self._law, self._gravity = config.leader, config.plant.gravity
+        self._controller, self._gravity = config.leader, config.plant.gravity
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._on_pid = config.follower.residual_on_pid
         self._tilt_integral_gain = config.leader.tilt_integral_gain
@@ -165,7 +165,7 @@ class Laws:
         """(error, its rate) on which the leader flies."""
         if self._free is not None:
             state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
-        if self._law.error == "object":
+        if self._controller.error == "object":
             return goal - state.position, -state.velocity
         error, rate = self._leader_place_error(state, goal)
         return self._along_free_axes(error), self._along_free_axes(rate)
@@ -191,9 +191,9 @@ class Laws:
         `follower_command`: what a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()
-        band = xp.asarray(self._law.integral_error_limit, dtype=goal.dtype)
+        band = xp.asarray(self._controller.integral_error_limit, dtype=goal.dtype)
         error, rate = self.leader_error(state, goal)
-        lead = self._law.integral_lead_time
+        lead = self._controller.integral_lead_time
         error = error + lead * rate if lead else error
         own = integral[..., :3] + period * clipped(error, -band, band)
         if not self._on_pid:
@@ -213,7 +213,7 @@ class Laws:
         return xp.concat([own, level, average], axis=-1)
 
     def leader_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
-        """The leader's command at `state`; `integral` of its error so far, see `Laws`."""
+        """The leader's command at `state`; `integral` of its error so far, see `Controllers`."""
         wanted = self._pid_command(state, goal, integral)
         return wanted if not self._on_pid else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
 
@@ -221,14 +221,14 @@ class Laws:
         """A network's `command` in body axes, which holds the PD law, with its share of the integrals if it has one."""
         if not self._on_pid:
             return command
-        xp, law = command.__array_namespace__(), self._law
-        ki = xp.asarray(law.ki, dtype=command.dtype)
+        xp, controller = command.__array_namespace__(), self._controller
+        ki = xp.asarray(controller.ki, dtype=command.dtype)
         more = leader.command(ki * integral[..., :3], 0.0, self._gravity, *self._limits)
         return self._clip(self._with_lift_difference(command + more - integral[..., 4:], integral, -self._lift_sign))
 
     def _pid_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         error, rate = self.leader_error(state, goal)
-        gains = self._law.kp, self._law.kd, self._law.ki
+        gains = self._controller.kp, self._controller.kd, self._controller.ki
         return leader.pid_command(error, rate, integral[..., :3], gains, self._gravity, *self._limits)
 
     def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:
