@@ -84,7 +84,7 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, 
         random, sample = disturbances.step(random)
         inputs, plant = Inputs(time, world.goal, world.goal, force, sample), carry.loop.plant
         carry, row = control_step(loop, controller, privileged, world.load, carry, inputs, 0.0)
-        most = rig.numbers.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
+        most = rig.parameters.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
         row = jax.tree.map(lambda part: part[None], row)._replace(time=time)
         return (carry, random, update(running, row, limit, most, leader)), None
 
@@ -100,7 +100,7 @@ class AnyRigController(NetworkController):
     def on(self, rig: RigTable, plant: Plant) -> AnyRigController:
         """The law of the followers of `rig`, drones like those of `plant`."""
         found = copy.copy(self)
-        found._geometry = team_geometry(plant, rig.numbers.mounts, rig.size)
+        found._geometry = team_geometry(plant, rig.parameters.mounts, rig.size)
         return found
 
 

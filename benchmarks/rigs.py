@@ -101,7 +101,7 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
                 whole.setdefault(known, []).append(row)
                 rows.append({**row, "seconds": seconds})
                 say(rows[-1], ".3g")
-        rejected = {"drawn": drawn.draws, "unstable": drawn.unstable, "untrimmed": drawn.untrimmed}
+        rejected = {"drawn": drawn.candidates, "unstable": drawn.unstable, "untrimmed": drawn.untrimmed}
         rows.append({"drones": size, "rigs": options.rigs, **rejected})
     shares = {
         name: {key: float(np.mean([row[key] for row in parts])) for key in SHARES if key in parts[0]}

@@ -172,7 +172,7 @@ class TransportEnv:
         number: Int[Array, ""] | None = None,
         rig: RigTable | None = None,
     ) -> State:
-        """A sampled initial state, at rest or nearly so. `number` and `rig` as in `ResetDistribution.draw`."""
+        """A sampled initial state, at rest or nearly so. `number` and `rig` as in `ResetDistribution.sample`."""
         world, observation = self._fresh_world(rng, number, rig)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
@@ -284,8 +284,8 @@ class TransportEnv:
         chosen: RigTable | None = None,
     ) -> tuple[PipelineState, Float[Array, "... 18"]]:
         """(world, its first observation)."""
-        load, plant, goal, rig = self._resets.draw(rng, number, chosen)
-        parameters = () if rig is None else rig.numbers if rig.drawn is None else rig.drawn.numbers
+        load, plant, goal, rig = self._resets.sample(rng, number, chosen)
+        parameters = () if rig is None else rig.parameters if rig.row is None else rig.row.parameters
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
         has_integrals = self._resets.has_battery and self.config.follower.residual_on_pid
@@ -309,9 +309,9 @@ class TransportEnv:
         if not self._controller.geometry:
             return None
         plant = self.config.plant
-        if rig is not None and rig.drawn is not None:
-            return team_geometry(plant, rig.drawn.numbers.mounts, rig.drawn.size)
-        parameters = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
+        if rig is not None and rig.row is not None:
+            return team_geometry(plant, rig.row.parameters.mounts, rig.row.size)
+        parameters = plant_parameters(plant, self.config.attitude) if rig is None else rig.parameters
         mounts, masses = jnp.asarray(parameters.mounts, jnp.float32), jnp.asarray(parameters.drone_mass)
         return team_geometry(plant, mounts, (masses > 0).sum().astype(jnp.float32))
 

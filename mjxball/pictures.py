@@ -101,7 +101,7 @@ def plan(
     return _svg(int(size), int(size) + 40, parts)
 
 
-def metadata(title: str, facts: Mapping[str, object], picture: str = "") -> str:
+def summary(title: str, facts: Mapping[str, object], picture: str = "") -> str:
     """HTML of a title, `facts` as lines of name and value, and an SVG `picture`."""
     rows = "".join(
         f"<div><b>{html.escape(str(name))}</b> {html.escape(str(value))}</div>" for name, value in facts.items()

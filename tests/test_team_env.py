@@ -163,11 +163,11 @@ class TestWorlds:
         flies = np.asarray(rig.flies.sum(axis=1), int)
         np.testing.assert_array_equal(flies, np.resize(SIZES, 400))
         lifted = np.asarray(plant.rotor_force).sum(axis=(1, 2))
-        own = rig.numbers
+        own = rig.parameters
         weight = 9.81 * (np.asarray(own.drone_mass).sum(axis=1) + np.asarray(own.carrier_mass) + load.object_mass)
         np.testing.assert_allclose(lifted, weight, rtol=1e-5)
         assert (np.asarray(plant.rotor_force).any(axis=2).sum(axis=1) == flies).all()
-        radius = np.asarray(rig.numbers.ball_limit) + config.plant.ball_radius
+        radius = np.asarray(rig.parameters.ball_limit) + config.plant.ball_radius
         time = jnp.linspace(0.0, 30.0, 200)
         path = jax.vmap(lambda one, t: jax.vmap(lambda s: paths(config, s, one))(t), in_axes=(0, None))
         offset = jax.jit(path)(load, time)

@@ -141,7 +141,7 @@ class Environments(Protocol):
         """The same environments, with the step of a single one batched by `transform`, such as `jax.vmap`."""
         ...
 
-    def drawn(self, envs: Any, key: Array) -> Any:
+    def sampled(self, envs: Any, key: Array) -> Any:
         """Sampled initial states, one for each of `envs`, to pass to `step`."""
         ...
 
@@ -150,7 +150,7 @@ class Environments(Protocol):
     ) -> tuple[Any, Transition]:
         """Step `envs` with `action`, then reset those whose episode ended.
 
-        Initial states are sampled with `key`, or taken from `fresh` (of `drawn`), which avoids sampling at every step.
+        Initial states are sampled with `key`, or taken from `fresh` (of `sampled`), which avoids it at every step.
         With neither, ended episodes go on.
         """
         ...

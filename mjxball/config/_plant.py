@@ -86,7 +86,7 @@ class Plant:
         }
         mounts = [drone.mount for drone in self.drones]
         drawn = pictures.plan(mounts, self.leader, self.of_drones("arm"), self.object_size)
-        return pictures.metadata(f"rig of {self.count} drones, from above", facts, drawn)
+        return pictures.summary(f"rig of {self.count} drones, from above", facts, drawn)
 
     @property
     def count(self) -> int:

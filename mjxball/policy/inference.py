@@ -100,7 +100,7 @@ class Policy:
             lines += [pictures.Curve("evaluated", curve["eval_steps"], curve["eval_return"], dots=True)]
         plot = pictures.curves(lines, "environment steps", "return of an episode") if lines else ""
         facts = {name: value for name, value in self._facts.items() if value is not None}
-        return pictures.metadata(f"policy {self.name}", facts, plot)
+        return pictures.summary(f"policy {self.name}", facts, plot)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:

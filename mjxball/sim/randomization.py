@@ -40,11 +40,11 @@ PLACES = 16  # random waypoints of a CG before it starts over
 class Rig(NamedTuple):
     """The rig of an environment with random rigs."""
 
-    numbers: PlantParameters  # padded to the plant's drones
+    parameters: PlantParameters  # padded to the plant's drones
     flies: Float[Array, " drones"]  # 1 for a drone that exists, 0 for padding
     proportion: Scalar  # radius over the plant's, a factor on CG amplitudes
     size_ratio: Scalar  # number of drones over the plant's, a factor on the object's mass
-    drawn: rigs.RigTable | None = None  # row of a table of random rigs, which includes the load
+    row: rigs.RigTable | None = None  # row of a table of random rigs, which includes the load
 
 
 class ResetDistribution:
@@ -79,7 +79,7 @@ class ResetDistribution:
         self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
-    def draw(
+    def sample(
         self,
         rng: Array,
         number: Int[Array, ""] | None = None,
@@ -122,7 +122,7 @@ class ResetDistribution:
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*MASS_CHANGE_TIME)[None],
         )
-        if rig is not None and rig.drawn is not None:
+        if rig is not None and rig.row is not None:
             load = self._with_rig_load(load, rig, jax.random.fold_in(rng, 13))
         if self.varies:
             load = self._varied(load, jax.random.fold_in(rng, 2))
@@ -143,18 +143,18 @@ class ResetDistribution:
             velocity=symmetric(scenario.start_velocity),
             believed_mass=load.believed_mass,
             ball_offset=(self._direction(rng, 9) if self._in_plane else 1.0) * symmetric(scenario.ball_start, 1)[0],
-            parameters=None if rig is None else rig.numbers,
+            parameters=None if rig is None else rig.parameters,
         )
         return load, plant, symmetric(scenario.goal_range), rig
 
     def _with_rig_load(self, load: Load, rig: Rig, key: Array) -> Load:
         """`load` with the masses, thrusts and CG reach of the row in `rig`."""
-        row: Any = rig.drawn
+        row: Any = rig.row
         far, stepped = jax.random.uniform(key, (2,))
         load = load._replace(object_mass=row.object_mass, believed_mass=row.believed_mass, thrust_scale=row.thrust)
         change = self.config.rigs.mass_step * (2 * stepped - 1) * row.object_mass
         assumed = (row.believed_mass, row.thrust, self.config.scenario.trim_margin, *rigs.command_limits(self.config))
-        later = rigs.trimmed_reach(rig.numbers, row.object_mass + change, *assumed)
+        later = rigs.trimmed_reach(rig.parameters, row.object_mass + change, *assumed)
         change = jnp.where(later < 0, 0.0, change)
         reach = jnp.where(later < 0, row.reach, jnp.minimum(row.reach, later))
         return load._replace(
@@ -165,11 +165,11 @@ class ResetDistribution:
 
     def trimmed(self, load: Load, rig: Rig | None = None) -> Scalar:
         """CG amplitude [m] that can be trimmed before and after the mass changes; negative: none."""
-        if rig is not None and rig.drawn is not None:  # the amplitude was sampled within it
+        if rig is not None and rig.row is not None:  # the amplitude was sampled within it
             return load.cg_amplitude
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
         if self._several or self._in_plane or rig is not None:
-            parameters, leader = (self._constants if rig is None else rig.numbers), self.config.plant.leader
+            parameters, leader = (self._constants if rig is None else rig.parameters), self.config.plant.leader
             rest = (self.config.scenario.trim_margin, load.believed_mass, load.thrust_scale)
             rotors = jnp.minimum(*(safe_radius(parameters, leader, mass, *rest) for mass in masses))
             return jnp.minimum(rotors, self._commanded_radius(parameters, jnp.maximum(*masses)))
@@ -240,7 +240,7 @@ class ResetDistribution:
     def _rig_of_row(self, row: rigs.RigTable) -> Rig:
         flies = (jnp.arange(self.config.plant.count) < row.size).astype(jnp.float32)
         one = jnp.ones(())
-        return Rig(rigs.whole(row.numbers, self.config.plant.gravity), flies, one, one, row)
+        return Rig(rigs.whole(row.parameters, self.config.plant.gravity), flies, one, one, row)
 
     def _with_plane_path(self, load: Load, key: Array, rig: Rig | None) -> Load:
         """`load` with a random path of the CG in the plane, within the carrier and what can be trimmed."""
@@ -257,7 +257,7 @@ class ResetDistribution:
             longest = jnp.where(load.follows_path > 0, 1.0, longest)
         proportion: Scalar | float = 1.0 if rig is None else rig.proportion
         limit = jnp.maximum(self.trimmed(load, rig), 0.0)
-        if rig is None or rig.drawn is None:
+        if rig is None or rig.row is None:
             limit = jnp.minimum(cg_limit(self.config.plant) * proportion, limit)
         return load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude * proportion, limit / longest), cg_shape=shape)
 

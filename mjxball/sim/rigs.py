@@ -53,7 +53,7 @@ SHRINKS, ENOUGH_REACH, LEAST_REACH = 8, 0.1, 0.02
 class RigTable(NamedTuple):
     """R rigs, padded to the largest number of drones. Drone 0 leads; padding comes last."""
 
-    numbers: PlantParameters  # (R, ...); None for values common to all rigs, see `whole`
+    parameters: PlantParameters  # (R, ...); None for values common to all rigs, see `whole`
     size: Array  # (R,) number of drones without padding
     object_mass: Array  # (R,) true [kg]
     believed_mass: Array  # (R,) that every drone assumes [kg]
@@ -71,14 +71,14 @@ class RigTable(NamedTuple):
 
     def rows(self, chosen: Any) -> RigTable:
         """The rigs `chosen`, by any index of the first axis."""
-        return RigTable(_each(lambda part: part[chosen], self.numbers), *(part[chosen] for part in self[1:]))
+        return RigTable(_each(lambda part: part[chosen], self.parameters), *(part[chosen] for part in self[1:]))
 
 
 class SampledRigs(NamedTuple):
     """Sampled rigs, and the numbers of samples and rejections."""
 
     rigs: RigTable
-    draws: int
+    candidates: int
     unstable: int  # rejected: damping with rotor lag below LEAST_DAMPING, or rotors too weak for the slowest loop
     untrimmed: int  # rejected: CG reach too short even with believed mass and thrusts close to the truth
 
@@ -87,19 +87,19 @@ def sample_rigs(config: Config, size: int, count: int, seed: int) -> SampledRigs
     """`count` rigs of `size` drones, padded to the drones of `config.plant`; the same `seed` gives the same rigs."""
     random = np.random.default_rng([seed, size])
     parts: list[RigTable] = []
-    draws = damped = untrimmed = 0
+    candidates = damped = untrimmed = 0
     while sum(part.total for part in parts) < count:
         table, steady, held = _sample(config, size, 2 * count + 16, random)
         good = steady & held
         missing = count - sum(part.total for part in parts)
         last = np.flatnonzero(good)[:missing][-1] + 1 if good.sum() >= missing else len(good)
-        draws, damped, untrimmed = (
-            draws + last,
+        candidates, damped, untrimmed = (
+            candidates + last,
             damped + (~steady[:last]).sum(),
             untrimmed + (steady & ~held)[:last].sum(),
         )
         parts.append(table.rows(np.flatnonzero(good[:last])))
-    return SampledRigs(joined(parts), int(draws), int(damped), int(untrimmed))
+    return SampledRigs(joined(parts), int(candidates), int(damped), int(untrimmed))
 
 
 def training_rigs(config: Config) -> RigTable:
@@ -111,7 +111,7 @@ def training_rigs(config: Config) -> RigTable:
     def folded(part: Array) -> Array:
         return np.asarray(part, np.float32).reshape(*shape, *part.shape[1:])
 
-    return RigTable(_each(folded, table.numbers), *(folded(part) for part in table[1:]))
+    return RigTable(_each(folded, table.parameters), *(folded(part) for part in table[1:]))
 
 
 @functools.lru_cache(maxsize=16)
@@ -122,7 +122,7 @@ def held_out(config: Config, size: int, count: int = HELD_OUT_RIGS) -> RigTable:
 
 def joined(tables: list[RigTable]) -> RigTable:
     """The rigs of all `tables`, one table after the other."""
-    parameters = _each(lambda *parts: np.concatenate(parts), *(table.numbers for table in tables))
+    parameters = _each(lambda *parts: np.concatenate(parts), *(table.parameters for table in tables))
     return RigTable(parameters, *(np.concatenate(parts) for parts in zip(*(t[1:] for t in tables), strict=True)))
 
 
@@ -243,7 +243,7 @@ def _sample(config: Config, size: int, count: int, random: np.random.Generator) 
         thrust = np.where(short[:, None], 1 + 0.7 * (thrust - 1), thrust)
         reach = trimmed_reach(constants, load, believed, thrust, *limits)
     table = RigTable(
-        numbers=_with_padding(parameters, most),
+        parameters=_with_padding(parameters, most),
         size=np.full(count, size),
         object_mass=load,
         believed_mass=believed,
@@ -322,13 +322,13 @@ def unpadded(rigs: RigTable, size: int) -> RigTable:
     """`rigs`, all of `size` drones, without padding."""
     padded = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass", "mounts", "arm"}
     padded |= {"yaw_per_thrust", "rotor_lag"}
-    cut: dict[str, Any] = {name: getattr(rigs.numbers, name)[:, :size] for name in padded}
-    return rigs._replace(numbers=rigs.numbers._replace(**cut), thrust=rigs.thrust[:, :size])
+    cut: dict[str, Any] = {name: getattr(rigs.parameters, name)[:, :size] for name in padded}
+    return rigs._replace(parameters=rigs.parameters._replace(**cut), thrust=rigs.thrust[:, :size])
 
 
 def rig_config(config: Config, rigs: RigTable, row: int) -> Config:
     """`config` for the rig `row` alone, with its plant, attitude loops and nominal load."""
-    parameters, size = rigs.numbers, int(rigs.size[row])
+    parameters, size = rigs.parameters, int(rigs.size[row])
     drones = tuple(
         Drone(
             mass=float(parameters.drone_mass[row, k]),

@@ -73,7 +73,7 @@ class Trajectory(NamedTuple):
             lines = [pictures.Curve(f"flight {number}", self.time, far[:, number]) for number in range(far.shape[1])][
                 :4
             ]
-        return pictures.metadata("flight", {"of": self._summary}, pictures.curves(lines, "time [s]", "error [m]"))
+        return pictures.summary("flight", {"of": self._summary}, pictures.curves(lines, "time [s]", "error [m]"))
 
     @property
     def error(self) -> Float[Array, "T ... 3"]:

@@ -26,7 +26,7 @@ class LiveCurve:
 
         self._title, self._html, self._start = title, HTML, time.monotonic()
         self._points: dict[str, list[tuple[float, float]]] = {"episode_return": [], "eval_return": []}
-        self._shown: Any = display(HTML(pictures.metadata(title, {"compiling": "..."})), display_id=True)
+        self._shown: Any = display(HTML(pictures.summary(title, {"compiling": "..."})), display_id=True)
 
     def __call__(self, row: Mapping[str, float]) -> None:
         """Add the values of `row` (see `Report`) and redraw."""
@@ -40,4 +40,4 @@ class LiveCurve:
         share, seconds = row["steps"] / row["total"], time.monotonic() - self._start
         facts = {f"{share:.0%}": f"{row['steps']:,.0f} of {row['total']:,.0f} steps, {seconds:.0f} s"}
         figure = pictures.curves(lines, "environment steps", "return of an episode")
-        self._shown.update(self._html(pictures.metadata(self._title, facts, figure)))
+        self._shown.update(self._html(pictures.summary(self._title, facts, figure)))

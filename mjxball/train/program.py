@@ -167,7 +167,7 @@ class Environments:
         other._step = transform(self.env.step)
         return other
 
-    def drawn(self, envs: Envs, key: Array) -> Any:
+    def sampled(self, envs: Envs, key: Array) -> Any:
         """See `mjxball.algorithms.base.Environments`."""
         return self.reset(key)
 
@@ -177,7 +177,7 @@ class Environments:
         ended = done if others is None else done | others
 
         def reset_ended(before: Any) -> Any:
-            return self._mixed(ended, self.drawn(envs, key), before)
+            return self._mixed(ended, self.sampled(envs, key), before)
 
         if jax.default_backend() != "cpu":  # on a GPU the host would wait for the condition
             return envs._replace(states=reset_ended(envs.states))

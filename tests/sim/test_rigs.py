@@ -51,7 +51,7 @@ def test_a_row_is_the_plant_of_its_configuration() -> None:
         for row in range(3):
             config = rig_config(UNIVERSAL, rigs, row)
             found = plant_parameters(config.plant, config.attitude)
-            drawn = whole(rigs.rows(row).numbers, config.plant.gravity)
+            drawn = whole(rigs.rows(row).parameters, config.plant.gravity)
             for name in set(found._fields) - {"gains", "ball_limit"}:
                 np.testing.assert_allclose(
                     getattr(drawn, name), getattr(found, name), rtol=1e-9, atol=1e-15, err_msg=name
@@ -62,14 +62,14 @@ def test_a_row_is_the_plant_of_its_configuration() -> None:
 
 def test_draws_are_seeded_within_their_ranges_and_never_those_of_training() -> None:
     drawn, again = sample_rigs(UNIVERSAL, 3, 40, TRAINING), sample_rigs(UNIVERSAL, 3, 40, TRAINING)
-    assert drawn.draws == again.draws
+    assert drawn.candidates == again.candidates
     assert drawn.unstable > 0
     np.testing.assert_array_equal(drawn.rigs.reach, again.rigs.reach)
     assert not np.isin(held_out(UNIVERSAL, 3, 40).reach, drawn.rigs.reach).any()
     for row in range(40):
         assert not outside(rig_config(UNIVERSAL, drawn.rigs, row), UNIVERSAL)
     for axis in (0, 1):
-        found = loop_damping(drawn.rigs.frequency[:, axis], drawn.rigs.damping, drawn.rigs.numbers.rotor_lag[:, 0])
+        found = loop_damping(drawn.rigs.frequency[:, axis], drawn.rigs.damping, drawn.rigs.parameters.rotor_lag[:, 0])
         assert found.min() >= LEAST_DAMPING
 
 
@@ -96,7 +96,7 @@ def test_followers_can_hold_every_load_as_far_as_it_goes() -> None:
 
 def test_a_wrong_belief_takes_from_what_tilt_commands_hold() -> None:
     rigs = held_out(UNIVERSAL, 3, 8)
-    numbers, load, full = whole(rigs.numbers, 9.81), rigs.object_mass, np.ones_like(rigs.thrust)
+    numbers, load, full = whole(rigs.parameters, 9.81), rigs.object_mass, np.ones_like(rigs.thrust)
     right, less, more = (trimmed_reach(numbers, load, k * load, full, 0.15, 0.01, 6.0) for k in (1.0, 0.9, 1.1))
     held = 0.85 * 0.01 * 2 * numbers.gains.kp[:, :2].min(axis=1)  # by two followers, of limits of 0.01 rad
     np.testing.assert_allclose(right, held / (9.81 * load), rtol=1e-12)
