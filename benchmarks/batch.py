@@ -31,7 +31,7 @@ def fly_compiled(
     physics: str = "newton-euler",
     controller: Controller | None = None,
 ) -> list[Metrics]:
-    """Metrics of every flight, computed in float32; `law` in place of the follower's own.
+    """Metrics of every flight, computed in float32; `controller` in place of the follower's own.
 
     Delays, biases and resolutions are constants of the program, everything else is given to it.
     """

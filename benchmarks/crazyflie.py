@@ -2,10 +2,10 @@
 
 - stand: flights of 60 s from random ball offsets, rolls and heights, undisturbed. The ball is kept if it never touches
   an end stop; shares over all starts, of copy, adaptive, LQG and the policy.
-- flight: rigs drawn as the preset's training draws them (thrust of both and of each, motor lag, inertia, object mass,
-  CG motion, noise, delay, gusts, battery, firmware): only rigs that can hover are drawn. 20 s each; a crash is |e_o|
+- flight: rigs sampled as in the training of the preset (thrust of both and of each, motor lag, inertia, object mass,
+  CG motion, noise, delay, gusts, battery, firmware): only rigs that can hover are sampled. 20 s each; a crash is |e_o|
   beyond d_term or a world that diverges. RMSE and tilt after 5 s, of the same followers in the same worlds. All see the
-  same noise and delay; classical ones are told the nominal plant.
+  same noise and delay; classical ones know the nominal plant.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Without sockets or clock. Measured are the seconds until each drone's motors are off, speed at the first contact,
 largest tilt and drift between the fault and then. The table in docs/flying.md is made from
-benchmarks/results/fly_faults_virtual.json. `--onboard float32` (or `int8`) has the laws on the drones, in the apps' own
-C, compiled by gcc: a dead laptop and a lost heartbeat are faults as well then.
+benchmarks/results/fly_faults_virtual.json. `--onboard float32` (or `int8`) has the controllers on the drones, in the
+apps' own C, compiled by gcc: a dead laptop and a lost heartbeat are faults as well then.
 
 `--positioning` flies each positioning system of the twin instead, without a fault and with a pose lost: the error of O
 in hover after `SETTLING` seconds. A flow deck, which the runner refuses, flies with its guards wide open. The table in
@@ -38,7 +38,7 @@ from mjxfly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone
 from virtual_twin import MemoryLog, TrueState, VirtualTwin
 
 SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
-SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
+SETTLED, HOVER = 3.0, 6.0  # [s] under both controllers, until a fault may come and until the flight lands
 AXES = ("x", "y", "z")
 Injection = Callable[[VirtualTwin, int], None]
 
@@ -131,7 +131,7 @@ FAULTS: dict[str, Injection] = {
 
 
 def settings_of(policy: Policy, seconds: float) -> FlightSettings:
-    """What the command line would make of `policy`'s card."""
+    """What the command line would make of `policy`'s metadata."""
     config = FlightController(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
     return FlightSettings(seconds, goal, stand=stand, limits=limits_of(config, goal), times=times_of(config))
@@ -144,7 +144,7 @@ def cores_of(path: Path, weights: str) -> tuple[Library, Library]:
 
 
 def hover_on(path: Path, system: str, number: int, fault: str = "") -> Row:
-    """A flight of 20 s under both laws on positioning `system`; `fault` is injected in its middle, at the leader."""
+    """A flight of 20 s under both controllers on positioning `system`; `fault` of the leader in its middle."""
     policy = Policy.load(path)
     settings = settings_of(policy, 4 * SETTLING)
     if system == "flow":
@@ -181,7 +181,7 @@ def positionings(options: argparse.Namespace) -> list[Row]:
 
 
 def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
-    """The pair `SETTLED` [s] under both laws, which are `onboard` (float32, int8) or on the laptop."""
+    """The pair `SETTLED` [s] under both controllers, which are `onboard` (float32, int8) or on the laptop."""
     policy = Policy.load(path)
     world = VirtualTwin(
         policy,
@@ -311,7 +311,9 @@ def main(given: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", nargs="+", choices=FAULTS, metavar="FAULT", help="these faults alone")
     parser.add_argument("--positioning", action="store_true", help="hover on each positioning system instead")
-    parser.add_argument("--onboard", choices=("float32", "int8"), default="", help="the laws' weights on the drones")
+    parser.add_argument(
+        "--onboard", choices=("float32", "int8"), default="", help="the controllers' weights on the drones"
+    )
     options = parser.parse_args(given)
     options.only = options.only or [one for one in FAULTS if options.onboard or one not in ONBOARD]
     if options.positioning:

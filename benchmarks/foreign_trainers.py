@@ -13,7 +13,8 @@ PyTorch, `sbx-sac` sbx-rl as well, see docs/gym.md.
 
 `table` trains with each trainer in a process of its own, compiled anew, and prints its CPU seconds (user) from process
 start to policy file, the mean return of the policy without noise in the same 256 random episodes, and the metrics of
-the reference scenario. `copy` is the action zero: on the preset's PD law the follower then does what its leader does.
+the reference scenario. `copy` is the action zero: on the preset's PD controller the follower then does what its leader
+does.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 `python benchmarks/observer_tuning.py [observer|pid|mpc|mpc-team] [--rounds N] [--sets N] [--width W] [--json FILE]`
 
-Covariance matrix adaptation (CMA-ES, Hansen) over the logarithms of the gains. It goes on from those that the law has,
-so it says whether better ones are near; how these were found stands beside the law. All flights are
-flown undisturbed and with noise at level 1 and 40 ms of delay; what is made small is the sum over both.
+Covariance matrix adaptation (CMA-ES, Hansen) over the logarithms of the gains. It goes on from those that the
+controller has, so it says whether better ones are near; how these were found stands beside the controller. All flights
+are flown undisturbed and with noise at level 1 and 40 ms of delay; what is made small is the sum over both.
 
 - `observer`: 48 random feasible flights of known mass; the mean settling time, at most 30 s, and the mean peak over
   5 mm, at most 20
@@ -49,12 +49,12 @@ ALLOWED = {"pid": 0.04, "mpc": 0.0}  # overshoot that costs nothing
 
 def from_rest(config: Config) -> list[Scenario]:
     """The flights of `pid` and `mpc`: goals 0.7 to 1.1 m away along every axis."""
-    drawn = [
+    sampled = [
         *random_scenarios(config, KNOWN, False, SEED),
         *random_scenarios(config, UNKNOWN, True, SEED),
     ]
     still, random, found = Scenario(), np.random.default_rng(SEED), []
-    for one in drawn:
+    for one in sampled:
         start = {name: getattr(still, name) for name in ("start_position", "start_velocity", "start_tilt")}
         found.append(dataclasses.replace(one, goal=far_goal(random), seconds=SECONDS, **start))
     return found
@@ -109,12 +109,12 @@ def medians(runs: Sequence[Metrics], sets: int) -> dict[str, np.ndarray]:
 
 
 def costs_of(
-    controller: Any, drawn: list[Scenario], sets: int, allowed: float | None
+    controller: Any, sampled: list[Scenario], sets: int, allowed: float | None
 ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-    """(cost (S,), medians (S,) under each condition) of `law`, which flies all `drawn` with each of `sets`."""
+    """(cost (S,), medians (S,) under each condition) of `controller`, which flies all `sampled` with each of `sets`."""
     config = preset("paper")
     total, shown = np.zeros(sets), []
-    flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn * sets]
+    flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in sampled * sets]
     flown = fly_compiled(config, Baseline(controller, config), flights)
     for runs in (flown[: len(flights) // 2], flown[len(flights) // 2 :]):
         total += cost_of(runs, allowed).reshape(sets, -1).mean(axis=1)
@@ -135,8 +135,8 @@ def tuned(given: Any, values: np.ndarray) -> Any:
 def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """`costs_of` `mpc` with the tunings `sets` (S, k), on teams."""
     runs: tuple[list[list[Metrics]], ...] = tuple([[] for _ in sets] for _ in CONDITIONS)
-    for config, drawn in of_teams():
-        flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn]
+    for config, sampled in of_teams():
+        flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in sampled]
         controllers = [
             type("Tuned", (Mpc,), {"team_tuning": tuned(Mpc.team_tuning, values)})(config) for values in sets
         ]
@@ -154,10 +154,10 @@ def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarr
 def costs(controller: Any, sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """`costs_of` all `sets` (S, k) of gains of `observer` or `pid`, flown at once."""
     config, allowed = preset("paper"), ALLOWED.get(controller.name)
-    drawn = from_rest(config) if allowed is not None else random_scenarios(config, FLIGHTS, False, SEED)
-    each = np.tile(np.repeat(sets, len(drawn), axis=0), (len(CONDITIONS), 1))
+    sampled = from_rest(config) if allowed is not None else random_scenarios(config, FLIGHTS, False, SEED)
+    each = np.tile(np.repeat(sets, len(sampled), axis=0), (len(CONDITIONS), 1))
     gains = type(controller.gains)(*each.astype(np.float32).T)
-    return costs_of(type("Tuned", (controller,), {"gains": gains})(config), drawn, len(sets), allowed)
+    return costs_of(type("Tuned", (controller,), {"gains": gains})(config), sampled, len(sets), allowed)
 
 
 def costs_of_mpc(values: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:

@@ -3,7 +3,7 @@
 Needs gcc, gcc-arm-none-eabi and qemu-system-arm; without `--policies` it takes the shipped ones and a recurrent one of
 random weights for two Crazyflies. One step from the same memory, outputs compared bit for bit between both machines and
 with NumPy in float32. QEMU (netduinoplus2, an STM32F405) counts no cycles: time is the instructions of a call times the
-weights `WEIGHTS`, at 168 MHz. Flash and stack are those of the whole core of a follower's app, law, network and
+weights `WEIGHTS`, at 168 MHz. Flash and stack are those of the whole core of a follower's app, controller, network and
 supervisor, where the policy is one of a pair.
 """
 
@@ -261,7 +261,7 @@ def _ranges(operands: str) -> int:
 # --- followers --------------------------------------------------------------------------------------------------------
 
 FLIGHT = 500  # steps of a flight
-PAIR = Path("pair")  # the plant of a policy that has to be told its team
+PAIR = Path("pair")  # the plant of a policy that must know its team
 UNITS, HEAD = 48, 32  # of a recurrent follower for a pair of Crazyflies
 MAIN = r"""
 #include "policy.h"

@@ -1,4 +1,4 @@
-"""Followers on random rigs: many rigs at once, each with its own numbers, and laws that know them."""
+"""Followers on random rigs: many rigs at once, each with its own numbers, and controllers that know them."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def fly(
 ) -> list[list[Metrics]]:
     """Metrics of `flights` random flights of every rig (R) of one size, the same ones for every follower.
 
-    `laws`: one for all rigs, or R of one class, each made for its rig. In float32 on JAX's default device.
+    `controllers`: one for all rigs, or R of one class, each made for its rig. In float32 on JAX's default device.
     """
     one_rig = dataclasses.replace(config.rigs, number=1)
-    # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own law.
+    # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own controller.
     own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig)
     env, period = TransportEnv(own, "newton-euler"), own.timing.control_period
     numbers: list[Any] | None = None
@@ -95,10 +95,10 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, 
 
 
 class AnyRigController(NetworkController):
-    """A policy for any rig, which is told every rig's geometry."""
+    """A policy for any rig, which is given every rig's geometry."""
 
     def on(self, rig: RigTable, plant: Plant) -> AnyRigController:
-        """The law of the followers of `rig`, drones like those of `plant`."""
+        """The controller of the followers of `rig`, drones like those of `plant`."""
         found = copy.copy(self)
         found._geometry = team_geometry(plant, rig.parameters.mounts, rig.size)
         return found
@@ -110,15 +110,15 @@ def rig_controllers(config: Config, rigs: RigTable, make: Callable[[Config], Con
 
 
 def stacked(controllers: Sequence[Controller]) -> tuple[list[Any], Callable[[list[Any]], Controller]]:
-    """(the numbers of `laws` of one class, stacked; a law from one row of them)."""
+    """(the numbers of `controllers` of one class, stacked; a controller from one row of them)."""
     example, structure = jax.tree.flatten(vars(controllers[0]))
     varies = [isinstance(leaf, (float, np.ndarray, np.floating)) for leaf in example]
     rows = [jax.tree.leaves(vars(controller)) for controller in controllers]
-    numbers = [np.stack([row[place] for row in rows]) for place, drawn in enumerate(varies) if drawn]
+    numbers = [np.stack([row[place] for row in rows]) for place, differs in enumerate(varies) if differs]
 
     def rebuild(row: list[Any]) -> Controller:
         found, values = copy.copy(controllers[0]), iter(row)
-        leaves = [next(values) if drawn else leaf for leaf, drawn in zip(example, varies, strict=True)]
+        leaves = [next(values) if differs else leaf for leaf, differs in zip(example, varies, strict=True)]
         vars(found).update(jax.tree.unflatten(structure, leaves))
         return found
 

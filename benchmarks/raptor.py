@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Fly both tracks of the pair and write the entry."""
     parser = cli.make_parser("python benchmarks/raptor.py", __doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("out", type=Path, metavar="OUT.json")
-    parser.add_argument("--draw", type=int, default=0, metavar="N", help="flights drawn anew (default 0)")
+    parser.add_argument("--draw", type=int, default=0, metavar="N", help="flights sampled anew (default 0)")
     options = parser.parse_args(arguments)
     cli.output_file(options.out, ".json")
     try:
@@ -121,7 +121,7 @@ def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
 
 
 def see(own: np.ndarray, mount: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """What RAPTOR is told (n, 18) but its last command, of a drone's observation (n, 18): its place less its goal."""
+    """RAPTOR's input (n, 18) without its last command, of a drone's observation (n, 18): its place less its goal."""
     matrix = np.asarray(rotations.matrix_from_quaternion(rotations.quaternion_from_euler(own[:, 3:6])))
     off = own[:, :3] - goal - mount
     off = off * np.minimum(1.0, NEAR / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-9))

@@ -1,8 +1,8 @@
-"""One follower on 1000 rigs that no training drew, beside laws that are told each rig.
+"""One follower on 1000 rigs that no training sampled, beside controllers that know each rig.
 
 Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
 delay as in training (settings of the preset `universal`). The object's mass stays what it is; with --mass-step it
-changes once in a flight, as in training, and the LQGs are told at once. `lqg-known-rig` and `lqg-slow-known-rig` know
+changes once in a flight, as in training, and the LQGs know it at once. `lqg-known-rig` and `lqg-slow-known-rig` know
 the rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque
 alone.
 The better of both is the reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met
@@ -53,7 +53,7 @@ Made = tuple[str, Callable[[Config, RigTable], Controller | list[Controller]]]
 
 
 def followers(paths: Sequence[Path]) -> list[Made]:
-    """(name, what makes its law for rigs of one size), the two LQGs that know each rig first."""
+    """(name, what makes its controller for rigs of one size), the two LQGs that know each rig first."""
     return [
         ("lqg-known-rig", lambda config, rigs: rig_controllers(config, rigs, KnownRigLqg)),
         ("lqg-slow-known-rig", lambda config, rigs: rig_controllers(config, rigs, SlowKnownRigLqg)),
@@ -88,8 +88,8 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
     """Every follower on held-out rigs of all sizes, and the shares of rigs that are met."""
     rows, whole = list[Row](), dict[str, list[Row]]()
     for size in options.sizes:
-        drawn = sample_rigs(config, size, options.rigs, options.seed)
-        rigs = unpadded(drawn.rigs, size)
+        sampled = sample_rigs(config, size, options.rigs, options.seed)
+        rigs = unpadded(sampled.rigs, size)
         flown: dict[str, list[list[Metrics]]] = {}
         for name, make in followers(options.policies):
             begun = time.perf_counter()
@@ -101,7 +101,7 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
                 whole.setdefault(known, []).append(row)
                 rows.append({**row, "seconds": seconds})
                 say(rows[-1], ".3g")
-        rejected = {"drawn": drawn.candidates, "unstable": drawn.unstable, "untrimmed": drawn.untrimmed}
+        rejected = {"drawn": sampled.candidates, "unstable": sampled.unstable, "untrimmed": sampled.untrimmed}
         rows.append({"drones": size, "rigs": options.rigs, **rejected})
     shares = {
         name: {key: float(np.mean([row[key] for row in parts])) for key in SHARES if key in parts[0]}

@@ -109,7 +109,7 @@ def read_levels() -> list[Suite]:
 
 
 class Stacked:
-    """Policies of one law; the first of n equal parts of a batch belongs to the first of them, and so on."""
+    """Policies of one controller; the first of n equal parts of a batch belongs to the first of them, and so on."""
 
     name = "stacked"
     needs_privileged = False

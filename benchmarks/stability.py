@@ -88,7 +88,7 @@ def linearised(
     cases: Sequence[tuple[float, float, float]],
     delay: int,
 ) -> list[list[Hover]]:
-    """`linearised_hovers` of every one of k laws, `law` of traced numbers: a tree of arrays (k, ...)."""
+    """`linearised_hovers` of every one of k controllers, `controller` of traced numbers: a tree of arrays (k, ...)."""
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         scenarios = [
             Scenario(omega=0.0, phase=np.pi / 2, amplitude=offset, mass=mass, believed_mass=believed)

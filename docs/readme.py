@@ -17,7 +17,7 @@ REPOSITORY = Path(__file__).parents[1]
 README = REPOSITORY / "README.md"
 BLOCK = re.compile(r"(?<=<!-- docs/readme.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
 FOLLOWERS = {
-    "copy": "`copy`: the PD law alone, optimum of the paper's reward",
+    "copy": "`copy`: the PD controller alone, optimum of the paper's reward",
     "adaptive": "`adaptive`",
     "pid": "`pid`",
     "observer": "`observer`: PD, disturbance observer",
@@ -34,8 +34,8 @@ follower | settles to 2 % [s] | 90 % of peaks below [mm] | met [%] | met, mass u
 
 `balance` settles soonest, undisturbed sways least, and serves known and unknown masses with one set of {parameters}
 weights. Under noise its commands change by {own:.0f} mrad a step, those of the others that settle within 3 s by
-{least:.0f} to {most:.0f}; of these `{sparing}` spares the rotors most. Of classical laws `lqg-slow` meets most, told
-the mass. The training below meets {first:.0f} %.
+{least:.0f} to {most:.0f}; of these `{sparing}` spares the rotors most. Of classical controllers `lqg-slow` meets most,
+given the mass. The training below meets {first:.0f} %.
 
 """
 

@@ -57,7 +57,7 @@ def main() -> None:
     scenario = Scenario(omega=OMEGA, amplitude=AMPLITUDE, goal=GOAL, seconds=END)
     followers = []
     for name, text, controller in (
-        ("copy", "PD law alone", make_baseline("copy", config)),
+        ("copy", "PD controller alone", make_baseline("copy", config)),
         ("lqg-offset-free", "classical law", make_baseline("lqg-offset-free", config)),
         ("balance", "trained network", Policy.load(shipped_policy("balance"))),
     ):

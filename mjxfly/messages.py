@@ -58,7 +58,7 @@ FIELDS = {
     "mjxball_msgs/Setpoint": "std_msgs/Header header\nfloat64 roll  # [deg], the wire's sign\nfloat64 pitch  # [deg]\n"
     "float64 yaw_rate  # [deg/s]\nfloat64 thrust  # 0 .. 65535",
     "mjxball_msgs/Health": "std_msgs/Header header\nfloat64[3] variance  # of the position [m2]\n"
-    "float64[4] motors  # PWM 0 .. 65535\nfloat64 thrust  # of the setpoint in force, NaN: not told",
+    "float64[4] motors  # PWM 0 .. 65535\nfloat64 thrust  # of the setpoint in force, NaN: not reported",
     "mjxball_msgs/Follower": "std_msgs/Header header\nfloat64[] observation\nfloat64[] hidden  # state of the GRU",
 }  # fmt: skip
 TYPES = {  # by the last part of a topic

@@ -111,7 +111,7 @@ def assert_process_refuses(arguments: Sequence[object], here: Path) -> None:
 
 
 def load_arrays(path: Path = TRANSPORT) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and card of a policy file, free to be damaged."""
+    """Arrays and metadata of a policy file, free to be damaged."""
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
     return arrays, json.loads(str(arrays.pop("card")))

@@ -229,7 +229,7 @@ def hostile_text(draw: Random) -> str:
 
 
 def metadata_text(draw: Random, content: bytes) -> bytes:
-    """The whole card replaced."""
+    """The whole metadata replaced."""
     return _with_metadata(content, hostile_text(draw))
 
 
@@ -256,7 +256,7 @@ def damaged(draw: Random, tree: Any) -> Any:
 
 
 def metadata_values(draw: Random, content: bytes) -> bytes:
-    """Fields of the card replaced, removed, renamed."""
+    """Fields of the metadata replaced, removed, renamed."""
     metadata = json.loads(str(np.load(io.BytesIO(_entries(content)["card.npy"]))))
     return _with_metadata(content, json.dumps(damaged(draw, metadata)))
 

@@ -1,4 +1,4 @@
-"""Support: policies of the Crazyflie presets that nobody trained: the leader's PD law, copied."""
+"""Support: policies of the Crazyflie presets that nobody trained: the leader's PD controller, copied."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ ODD_FILES: dict[str, Content] = {
 
 
 def _changed(metadata: Callable[[str], str] = str, weight: float | None = None) -> bytes:
-    """A shipped policy file with another text as its card, or one weight of another value."""
+    """A shipped policy file with another text as its metadata, or one weight of another value."""
     with np.load(shipped_policy("balance")) as arrays:
         found = {name: array.copy() for name, array in arrays.items()}
     found["card"] = np.array(metadata(str(found["card"])))
@@ -93,7 +93,7 @@ def policies() -> dict[str, Content]:
         "limits of NaN": _edited("command_limits", [float("nan"), 6.0]),
         "a twice given key": _changed(lambda text: '{"gravity": 1.62, ' + text[1:]),
         "flown by one drone": _edited("flown", {"drones": [1], "seconds": 60}),
-        "a card of 100 000 brackets": _changed(lambda text: "[" * 100_000),
+        "metadata of 100 000 brackets": _changed(lambda text: "[" * 100_000),
         **{
             f"{field} {told}": _edited(field, [number] * count if count else number)
             for field, count in METADATA_VALUES.items()

@@ -110,7 +110,7 @@ class Bench:
         return sent
 
     def take_off(self) -> None:
-        """To the first period under the laws, which the laptop asks for: this pair does not leave the ground."""
+        """To the first period under the controllers, which the laptop asks for: this pair does not leave the ground."""
         for phase, periods in ((AppPhase.IDLE, 3), (AppPhase.SPIN, 5), (AppPhase.RAMP, 150), (AppPhase.FLY, 5)):
             for _ in range(periods):
                 self.tick(phase)

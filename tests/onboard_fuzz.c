@@ -72,7 +72,7 @@ static void check(const mjxball_setpoint *out, uint8_t before) {
     if (!within(&out->roll, 1, 15.001f) || !within(&out->pitch, 1, 15.001f)) fail("angle beyond the limits", out);
     if (!(out->thrust >= 10001 && out->thrust <= 60000)) fail("thrust beyond the limits", out);
     if ((app.phase == MJXBALL_FLY || app.phase == MJXBALL_LAND) && !within(app.command, 3, 1000))
-        fail("a law that commands no numbers flies on", out);
+        fail("a controller that commands no numbers flies on", out);
     if (rate.memory) return;
     if (!within(app.command, 3, 100) || !within(app.integral, 7, 1e6f) || !within(app.velocity, 3, 200)
         || !within(app.position, 3, 2000) || !within(app.origin, 3, 2000) || !within(&app.trim, 1, 60000)

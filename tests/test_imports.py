@@ -279,7 +279,12 @@ class TestTheReader:
 
     def test_from_what_trains_to_what_flies(self, tmp_path: Path) -> None:
         assert direction_faults(self.package(tmp_path, env="def f():\n    import mjxfly.policy_setup\n"))
-        for text in ("from mjxfly import card", "run_module('mjxfly.main')", "['-m', f'mjxfly.{name}']", "'-m mjxfly'"):
+        for text in (
+            "from mjxfly import policy_setup",
+            "run_module('mjxfly.main')",
+            "['-m', f'mjxfly.{name}']",
+            "'-m mjxfly'",
+        ):
             assert names_of_flight(text), text
         assert not names_of_flight("raise InputError('mjxball.view: mjxfly.view plays it')")
 

@@ -1,4 +1,4 @@
-"""Names, cards and logs are text in every page that is made of them: no element, no script, no placeholder."""
+"""Names, metadata and logs are text in every page that is made of them: no element, no script, no placeholder."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def elements(tab: Any) -> dict[str, int]:
 
 @pytest.mark.slow
 def test_a_report_of_a_follower_with_a_hostile_name(browser: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    """Also in its card, in the command, in suites and variants, and in the figures."""
+    """Also in its metadata, in the command, in suites and variants, and in the figures."""
     monkeypatch.setattr(report_page, "film", lambda *_: (None, TEXT))
     config, suite = preset("paper"), suites.BY_NAME["delay"]
     variant = suite.variants[0]

@@ -48,7 +48,10 @@ MODULES = (  # known by their last name
     ),
     *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),
     *("mjxball.train.program", "mjxfly.app.protocol", "mjxfly.view.live"),
-    *(f"mjxfly.{name}" for name in ("card", "measured", "monitor", "positioning", "preflight", "probe", "setpoints")),
+    *(
+        f"mjxfly.{name}"
+        for name in ("measured", "monitor", "policy_setup", "positioning", "preflight", "probe", "setpoints")
+    ),
     *(f"mjxfly.{name}" for name in ("takeoff", "uri", "watchdog")),
 )
 DEG = 180 / math.pi

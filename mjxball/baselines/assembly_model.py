@@ -21,8 +21,8 @@ SIGNS = (-1.0, 1.0)  # of the roll torque of a load at +y, of the pitch torque o
 class AssemblyModel(NamedTuple):
     """N drones about roll and pitch, body axes, and how F = N - 1 followers share a wrench.
 
-    One law commands all followers of a team, on the mean of what they measure: estimates of one quantity that each of
-    them integrates for itself drift apart under noise, for the motion shows their sum alone. Its state has no
+    One controller commands all followers of a team, on the mean of what they measure: estimates of one quantity that
+    each of them integrates for itself drift apart under noise, for the motion shows their sum alone. Its state has no
     followers' axis, nor have a pair's arrays.
     """
 

@@ -87,6 +87,6 @@ def compare(settings: config.Config, physics: str, out: Path, policy: Path) -> i
         result for result in results if result.follower == trained.name and result.scenario == scenarios[0]
     )
     misses = check_bounds(trained, reference.metrics)
-    verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
+    verdict = "meets the bounds in its metadata" if not misses else f"misses its bounds: {'; '.join(misses)}"
     say(f"{policy} {verdict}; figures in {out / 'eval'}")
     return 0

@@ -73,7 +73,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add_flight(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")
-    parser.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
+    parser.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its metadata")
     about = "of the figures: screen (default), or paper: PDF of a column's width"
     parser.add_argument("--style", choices=STYLES, default="screen", help=about)
 
@@ -93,7 +93,7 @@ class Group:
         policies = load(self.followers.paths, lambda path: self.setup, options.force, compare_controllers, longest)
         unbounded = [policy.name for policy in policies if options.check and not policy.metadata["bounds"]]
         if unbounded:
-            raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
+            raise InputError(f"the metadata of policy {unbounded[0]} has no bounds to check")
         return policies
 
 

@@ -68,7 +68,7 @@ def native_scenarios(options: argparse.Namespace, setup: config.Config) -> Seque
     if not _given(options):
         return standard[:1] if options.policies or options.followers else standard
     if options.waveform or options.rolling is not None:
-        raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its card")
+        raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its metadata")
     return _asked(options, setup, standard[0], ball_start=standard[0].ball_start)
 
 

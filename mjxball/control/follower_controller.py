@@ -29,28 +29,28 @@ SATURATED = 6  # such numbers
 class FollowerController(NamedTuple):
     """What is around the network of one follower.
 
-    Its memory (..., m) holds that of `history`, the state of the network's GRU, and what it was told of its team.
+    Its memory (..., m) holds that of `history`, the state of the network's GRU, and its team's geometry.
     """
 
     history: ObservationHistory
     action_scale: tuple[float, float]  # at an action of 1: tilt [rad], vertical acceleration [m/s2]
     limits: tuple[float, float]  # of a command: tilt [rad], vertical acceleration [m/s2]
-    kp: Array  # (3,) of the leader's PD law
+    kp: Array  # (3,) of the leader's PD controller
     kd: Array  # (3,)
     gravity: float  # [m/s2]
-    residual: bool = True  # whether the action is added to the leader's PD law
+    residual: bool = True  # whether the action is added to the leader's PD controller
     units: int = 0  # H of the network's GRU, whose answer has its next state behind it
-    geometry: bool = False  # whether a network with a GRU is told where the drones are mounted, `control.geometry`
+    geometry: bool = False  # whether a network with a GRU knows where the drones are mounted, `control.geometry`
 
     @property
     def size(self) -> int:
         """Length m of the memory."""
-        return self.history.size + self.units + self._told
+        return self.history.size + self.units + self._geometry_size
 
     @property
     def input_size(self) -> int:
         """How many numbers n of `network_input` are before a GRU's state."""
-        return OBSERVATION_SIZE + self.history.size + (SATURATED if self.units else 0) + self._told
+        return OBSERVATION_SIZE + self.history.size + (SATURATED if self.units else 0) + self._geometry_size
 
     def mask(self, ignore_position: bool) -> list[float]:
         """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
@@ -58,11 +58,11 @@ class FollowerController(NamedTuple):
         return shown + [1.0] * (self.input_size + self.units - len(shown))
 
     @property
-    def _told(self) -> int:
+    def _geometry_size(self) -> int:
         return self.geometry * GEOMETRY_SIZE
 
     def start(self, observation: Array, geometry: Array | None = None) -> Array:
-        """Memory (..., m) before the first `observation` (..., 18); `geometry` (..., 4) of a law that needs it."""
+        """Memory (..., m) before the first `observation` (..., 18); `geometry` (..., 4) if `geometry` is set."""
         remembered = self.history.start(observation)
         if not self.units:
             return remembered
@@ -77,12 +77,12 @@ class FollowerController(NamedTuple):
         seen = self.history.network_input(observation, memory[..., : self.history.size])
         if not self.units:
             return seen
-        xp, told = observation.__array_namespace__(), memory[..., self.history.size + self.units :]
+        xp, known = observation.__array_namespace__(), memory[..., self.history.size + self.units :]
         small = [
             xp.tanh(observation[..., part] * (1 / scale))
             for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE))
         ]
-        return xp.concat([seen, *small, told, self.hidden(memory)], axis=-1)
+        return xp.concat([seen, *small, known, self.hidden(memory)], axis=-1)
 
     def hidden(self, memory: Array) -> Array:
         """State (..., H) of the network's GRU in `memory` (..., m)."""
@@ -103,5 +103,5 @@ class FollowerController(NamedTuple):
         remembered = self.history.next(memory[..., : self.history.size], observation, scaled[..., :ACTION_SIZE])
         if not self.units:
             return remembered
-        told = memory[..., self.history.size + self.units :]
-        return observation.__array_namespace__().concat([remembered, scaled[..., ACTION_SIZE:], told], axis=-1)
+        known = memory[..., self.history.size + self.units :]
+        return observation.__array_namespace__().concat([remembered, scaled[..., ACTION_SIZE:], known], axis=-1)

@@ -123,7 +123,7 @@ class OneThread:
         if self._of.setdefault("flight", here) is not here:
             raise RuntimeError(
                 f"follower {name} remembers a flight of another thread: give every thread its own (copy.copy), "
-                "reset it between flights, or keep the memory yourself (.law, which is pure)"
+                "reset it between flights, or keep the memory yourself (.controller, which is pure)"
             )
 
     def forget(self) -> None:
@@ -136,7 +136,8 @@ class OneThread:
 
 
 class Baseline:
-    """A `Controller` with its state, for one flight of one thread at a time (see `OneThread`); `law` itself is pure.
+    """A `Controller` with its state, for one flight of one thread at a time (see `OneThread`); `controller` itself is
+    pure.
 
     Set `privileged` before a call; without it the mass of `config.plant` is assumed.
     """

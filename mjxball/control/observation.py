@@ -79,7 +79,7 @@ def mount_frames(plant: Plant, mounts: Array | None = None) -> Array:
 def copy_command(
     observation: Array, kp: Array, kd: Array, gravity: float, tilt_limit: float, vertical_limit: float
 ) -> Array:
-    """The `copy` follower: the leader's PD law on the follower's own observation (..., 18) -> command (..., 3)."""
+    """The `copy` follower: the leader's PD controller on the follower's observation (..., 18) -> command (..., 3)."""
     error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
     zero = observation.__array_namespace__().zeros_like(error)
     return leader.pid_command(error, rate, zero, (kp, kd, 0.0), gravity, tilt_limit, vertical_limit)

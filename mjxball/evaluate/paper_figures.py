@@ -93,7 +93,7 @@ def read_curve(policy: Policy) -> Curve | None:
     columns: list[Any] = [stored.get(name) for name in named] if isinstance(stored, dict) else []
     valid = bool(columns) and all(isinstance(column, list) and all(map(_is_number, column)) for column in columns)
     if not valid or not columns[0] or [*map(len, columns[::2])] != [*map(len, columns[1::2])]:
-        raise InputError(f"the card of policy {policy.name} has an unsound training curve")
+        raise InputError(f"the metadata of policy {policy.name} has an unsound training curve")
     return Curve(*columns)
 
 
@@ -118,7 +118,9 @@ def plot_reward(policies: Sequence[Policy]) -> Figure:
         last = f"{curve.evaluated[-1]:.4g}" if curve.evaluated else "-"
         ends = (f"{curve.returns[0]:.4g}", f"{curve.returns[-1]:.4g}", last)
         rows.append((policy.name, "paper" if mimics else "task (ours)", f"{curve.steps[-1]:,.0f}", *ends))
-    rows += [(p.name, "no training curve in its card", "-", "-", "-", "-") for p in policies if read_curve(p) is None]
+    rows += [
+        (p.name, "no training curve in its metadata", "-", "-", "-", "-") for p in policies if read_curve(p) is None
+    ]
     legend_above(figure, axes[:, 0], 3)
     caption = (
         "Return of an episode of 1000 steps during training, from the policy files: grey the exploring policy, in "

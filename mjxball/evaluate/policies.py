@@ -1,4 +1,4 @@
-"""Policy files for an evaluation: fit to a plant, bounds of their cards, native plants."""
+"""Policy files for an evaluation: fit to a plant, bounds of their metadata, native plants."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mjxball.terminal import warn
 
 
 def load_policy(path: Path, config: Config, compare_controllers: bool = True, seconds: float = 0.0) -> Policy:
-    """Load a policy and refuse one that was made for another plant or rate, or for other control laws.
+    """Load a policy and refuse one that was made for another plant or rate, or for other controllers.
 
-    Warns on stderr where a flight of `seconds` [s] goes beyond what its card says it was flown for.
+    Warns on stderr where a flight of `seconds` [s] goes beyond what its metadata says it was flown for.
     """
     policy = _fitting(path, config, compare_controllers)
     for text in beyond_training(policy.metadata, config.plant.count, seconds):
@@ -28,16 +28,16 @@ def load_policy(path: Path, config: Config, compare_controllers: bool = True, se
 
 
 def beyond_training(metadata: dict[str, Any], drones: int, seconds: float) -> list[str]:
-    """How a flight of `seconds` [s] with so many `drones` goes beyond what `card` says of flights, one phrase each."""
+    """Ways in which a flight of `seconds` [s] with so many `drones` goes beyond `metadata`, one phrase each."""
     flown = metadata.get("flown")
     if flown is None:
         return []
     sizes, longest = sorted(flown["drones"]), flown["seconds"]
     found = []
     if drones not in sizes:
-        found.append(f"is good for teams of {', '.join(map(str, sizes))} drones by its card, and here are {drones}")
+        found.append(f"is good for teams of {', '.join(map(str, sizes))} drones by its metadata, and here are {drones}")
     if seconds > longest:
-        found.append(f"is good for {longest:g} s by its card, and this flight lasts {seconds:g} s")
+        found.append(f"is good for {longest:g} s by its metadata, and this flight lasts {seconds:g} s")
     return found
 
 
@@ -73,7 +73,7 @@ def _fitting(path: Path, config: Config, compare_controllers: bool) -> Policy:
 
 
 def _from_metadata(name: Path | str, record: dict[str, Any]) -> Config:
-    """The configuration that the card of the policy `name` holds; InputError, which names the policy, if it is none."""
+    """The configuration in the metadata of the policy `name`; InputError, which names the policy, if it is none."""
     try:
         return configs.from_record(record)
     except InputError as error:
@@ -81,12 +81,12 @@ def _from_metadata(name: Path | str, record: dict[str, Any]) -> Config:
 
 
 def flies_any_rig(policy: Policy) -> bool:
-    """Whether `policy` flies any rig, of which it is told where the drones are mounted alone."""
+    """Whether `policy` flies any rig, of which it knows where the drones are mounted alone."""
     return controller_of(policy.metadata).geometry and trained_rigs(policy).rigs.number > 0
 
 
 def trained_rigs(policy: Policy) -> Config:
-    """The configuration that a policy for any rig was trained with; the preset's where its card has none."""
+    """The configuration that a policy for any rig was trained with; the preset's where its metadata has none."""
     settings = policy.metadata.get("config")
     return _from_metadata(policy.name, settings) if isinstance(settings, dict) else configs.preset("universal")
 
@@ -117,7 +117,7 @@ def _refuse_other_controllers(path: Path, metadata: dict[str, Any], config: Conf
 
 
 def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
-    """What of the card's bounds a policy misses on the reference scenario, one phrase each."""
+    """What of the metadata's bounds a policy misses on the reference scenario, one phrase each."""
     misses = ["the flight failed"] if metrics.failed else []
     for name, bound in sorted(policy.metadata["bounds"].items()):
         value = getattr(metrics, name, None)
@@ -127,7 +127,7 @@ def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
 
 
 def native_config(path: Path) -> Config | None:
-    """The configuration in a policy's card if its plant is not the paper's: Crazyflies, a team, a rig; else None."""
+    """The configuration in the metadata if the plant is not the paper's (Crazyflies, a team, a rig), else None."""
     settings = Policy.load(path).metadata.get("config")
     if not isinstance(settings, dict):
         return None

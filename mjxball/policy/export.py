@@ -25,7 +25,8 @@ def policy_file(
 ) -> PolicyFile:
     """The policy file of a trained network, `learnt` (`algorithms.base.PolicyNetwork`), after `steps` steps.
 
-    `law`: `sim.follower.follower_controller(config)`. `origin` (command, seed, commit, ...) is added to the metadata.
+    `controller`: `sim.follower.follower_controller(config)`. `origin` (command, seed, commit, ...) is added to the
+    metadata.
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader

@@ -64,7 +64,7 @@ class PolicyFile:
 
 
 def controller_of(metadata: dict[str, Any]) -> FollowerController:
-    """The controller around the network of a policy file with metadata `card`; the first files have no `filters`."""
+    """The controller around the network of a policy file with `metadata`; the first files have no `filters`."""
     filters = tuple(metadata.get("filters", ()))
     return FollowerController(
         history=ObservationHistory(metadata["previous_action"], filters, float(metadata["control_period"])),
@@ -159,15 +159,15 @@ def load_network(path: str | os.PathLike[str]) -> Network:
 
 def _read_metadata(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.ndim != 0 or text.dtype.kind != "U":
-        raise PolicyFileError(f"{name}: the card is not one string")
+        raise PolicyFileError(f"{name}: the metadata is not one string")
     if text.dtype.itemsize > 4 * MAX_METADATA:  # parsed JSON takes fifty times as much memory
-        raise PolicyFileError(f"{name}: the card is longer than {MAX_METADATA} characters")
+        raise PolicyFileError(f"{name}: the metadata is longer than {MAX_METADATA} characters")
     try:
         metadata = parse_json(str(text))
     except (ValueError, RecursionError) as error:
-        raise PolicyFileError(f"{name}: the card is not JSON: {error}") from None
+        raise PolicyFileError(f"{name}: the metadata is not JSON: {error}") from None
     if not isinstance(metadata, dict):
-        raise PolicyFileError(f"{name}: the card is not a JSON object")
+        raise PolicyFileError(f"{name}: the metadata is not a JSON object")
     return metadata
 
 
@@ -186,7 +186,7 @@ def check(policy: PolicyFile, name: str) -> None:
     if (policy.observation_scale < 0).any() or (policy.action_scale <= 0).any():
         raise PolicyFileError(f"{name}: observation_scale must not be negative and action_scale must be positive")
     if not np.allclose(policy.action_scale, _action_scale(policy.metadata), rtol=1e-6, atol=0):
-        raise PolicyFileError(f"{name}: action_scale differs from the card's action_reach")
+        raise PolicyFileError(f"{name}: action_scale differs from the metadata's action_reach")
     _check_gru(policy, name, size, controller.units)
     width = size + controller.units
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
@@ -200,7 +200,7 @@ def check(policy: PolicyFile, name: str) -> None:
 
 def _check_gru(policy: PolicyFile, name: str, inputs: int, units: int) -> None:
     if (policy.gru is None) != (units == 0):
-        raise PolicyFileError(f"{name}: card field recurrent_units and arrays gru_* do not belong together")
+        raise PolicyFileError(f"{name}: metadata field recurrent_units and arrays gru_* do not belong together")
     if policy.gru is not None:
         shapes = (inputs, 3 * units), (units, 3 * units), (3 * units,)
         for label, array, shape in zip(GRU_ARRAYS, policy.gru, shapes, strict=True):
@@ -247,14 +247,14 @@ def _card_faults(metadata: dict[str, Any]) -> Iterator[str]:
         value = metadata.get(field)
         kinds = (int, float) if kind is float else kind
         if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
-            yield f"card field {field} is missing or not {kind.__name__}"
+            yield f"metadata field {field} is missing or not {kind.__name__}"
     if metadata["observation"] != [list(slot) for slot in OBSERVATION]:
         yield "the policy was made for another observation than this version's 18 numbers"
     if metadata["action"] != [list(slot) for slot in ACTION]:
         yield "the policy was made for another action than roll, pitch, vertical acceleration"
     config = metadata.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
-        yield "card field config is not a configuration"
+        yield "metadata field config is not a configuration"
     yield from _number_faults(metadata)
     if metadata["format_version"] == 5 and "context" in metadata:
         yield from _geometry_faults(metadata)
@@ -273,17 +273,17 @@ def _number_faults(metadata: dict[str, Any]) -> Iterator[str]:
         yield "filters must be up to 10 time constants of at least 1 ms"
     for field, length in LENGTHS.items():
         if len(metadata[field]) != length or not all(is_finite(value) and value >= 0 for value in metadata[field]):
-            yield f"card field {field} must be {length} finite numbers"
+            yield f"metadata field {field} must be {length} finite numbers"
     units, most = metadata.get("recurrent_units", 0), MAX_UNITS if metadata["format_version"] == 5 else 0
     if type(units) is not int or not min(most, 1) <= units <= most:
-        yield f"card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
+        yield f"metadata field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
     for field in ("control_period", "gravity"):
         if not (is_finite(metadata[field]) and metadata[field] >= 1e-6):
-            yield f"card field {field} must be positive"
+            yield f"metadata field {field} must be positive"
     if not all(map(is_finite, metadata["bounds"].values())):
-        yield "card field bounds must hold finite numbers"
+        yield "metadata field bounds must hold finite numbers"
     for odd in sorted(set(metadata["bounds"]) - set(BOUNDED)):
-        yield f"card field bounds names {odd!r}; known are {', '.join(BOUNDED)}"
+        yield f"metadata field bounds names {odd!r}; known are {', '.join(BOUNDED)}"
 
 
 def _geometry_faults(metadata: dict[str, Any]) -> Iterator[str]:
@@ -294,15 +294,15 @@ def _geometry_faults(metadata: dict[str, Any]) -> Iterator[str]:
         return
     team = metadata["team"]
     if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
-        yield "card field team must hold drone, mount_angle and context"
+        yield "metadata field team must hold drone, mount_angle and context"
     if not (is_finite(team["drone"]) and is_finite(team["mount_angle"])):
-        yield "card fields team.drone and team.mount_angle must be finite numbers"
+        yield "metadata fields team.drone and team.mount_angle must be finite numbers"
     context = team["context"]
     if not (isinstance(context, list) and len(context) == len(GEOMETRY) and all(map(is_finite, context))):
-        yield f"card field team.context must be {len(GEOMETRY)} finite numbers"
+        yield f"metadata field team.context must be {len(GEOMETRY)} finite numbers"
     share, _, _, room = context
     if share <= 1 or room <= 0:
-        yield "card field team.context: command_share must be above 1 and rotor_room positive"
+        yield "metadata field team.context: command_share must be above 1 and rotor_room positive"
 
 
 def _flown_faults(flown: Any) -> Iterator[str]:
@@ -311,7 +311,7 @@ def _flown_faults(flown: Any) -> Iterator[str]:
     drones, seconds = fields.get("drones"), fields.get("seconds", 0.0)
     counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
     if not (counts and is_finite(seconds) and seconds > 0):
-        yield "card field flown must hold drones, numbers above 1, and positive seconds"
+        yield "metadata field flown must hold drones, numbers above 1, and positive seconds"
 
 
 def is_finite(value: Any) -> bool:

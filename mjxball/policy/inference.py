@@ -24,7 +24,7 @@ ROUNDED = 1e-5  # tolerance for a GRU's state beyond 1, from rounding
 
 def missing_team_error(name: str) -> InputError:
     """The error for a policy that needs the geometry of its team and has none."""
-    return InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
+    return InputError(f"policy {name} must know its team: --plant NAME or FILE.toml, such as team4")
 
 
 def geometry_of(plant: Plant) -> np.ndarray:
@@ -44,8 +44,8 @@ def known_geometry(metadata: dict[str, Any], name: str) -> np.ndarray | None:
 class Policy:
     """A follower from a policy file, with the memory of past observations that its network needs.
 
-    One instance serves one flight, or one batch of worlds, in one thread; `reset()` starts another. `law` is the same
-    controller as pure functions of memory and observation.
+    One instance serves one flight, or one batch of worlds, in one thread; `reset()` starts another. `controller` is the
+    same controller as pure functions of memory and observation.
     """
 
     def __init__(self, contents: PolicyFile, name: str, dtype: type = np.float32):
@@ -208,7 +208,7 @@ class NetworkController:
         """
         geometry = _geometry_for(self.name, self._controller, self._geometry)
         if geometry is not None and geometry.ndim > 1 and observation.shape[-2:-1] != geometry.shape[:1]:
-            joined = f"policy {self.name} was told of {len(geometry)} followers (Policy.join)"
+            joined = f"policy {self.name} joined a team of {len(geometry)} followers (Policy.join)"
             raise InputError(f"{joined}, and an observation of shape {observation.shape} is not of so many")
         return self._controller.start(observation, geometry)
 
@@ -233,7 +233,7 @@ class NetworkController:
 
 
 def _geometry_for(name: str, controller: FollowerController, geometry: Array | None) -> Array | None:
-    """`geometry`. Raises InputError if it is None and `law` needs it."""
+    """`geometry`. Raises InputError if it is None and `controller` needs it."""
     if controller.geometry and geometry is None:
-        raise InputError(f"policy {name} has to be told its team before it flies (Policy.join)")
+        raise InputError(f"policy {name} must know its team before it flies (Policy.join)")
     return geometry

@@ -20,7 +20,7 @@ CRAZYFLIES = Path("crazyflie")  # default plant of a policy for any rig
 
 
 def is_for_any(metadata: dict[str, Any]) -> bool:
-    """Whether `card` is the metadata of a policy for any rig that has not been adapted to one."""
+    """Whether `metadata` is that of a policy for any rig that has not been adapted to one."""
     return controller_of(metadata).geometry and "team" not in metadata
 
 
@@ -32,7 +32,7 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
     """
     if not controller_of(policy.metadata).geometry:
         if config is not None or drone is not None:
-            raise InputError(f"{name} is told nothing of its team: leave --plant and --drone out")
+            raise InputError(f"{name} knows nothing of its team: leave --plant and --drone out")
         return policy
     if config is None and drone is None and "team" in policy.metadata:
         return policy
@@ -51,7 +51,7 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
 
 
 def _metadata_of(config: Config, metadata: dict[str, Any]) -> dict[str, Any]:
-    """Metadata fields for plant and configuration of the policy with `card` on the plant of `config`.
+    """Metadata fields for plant and configuration of the policy with `metadata` on the plant of `config`.
 
     Preset, controllers and control period are those of training.
     """

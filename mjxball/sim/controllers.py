@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Vector
     from mjxball.sim.disturbances import Observation
 
-    Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID law
+    Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID controller
 
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
 MAX_LIFT_DIFFERENCE = 1.5
-WASHOUT_TIME = 8.0  # time constant of the high pass on what a network adds to both drones' PID law [s]
+WASHOUT_TIME = 8.0  # time constant of the high pass on what a network adds to both drones' PID controller [s]
 
 
 class BodyState(NamedTuple):
@@ -39,7 +39,7 @@ class BodyState(NamedTuple):
 
 
 class Body(Protocol):
-    """What all drones' laws need of a state: a simulated one, or one that was put together from the drones' own."""
+    """The part of a state, simulated or composed of the drones' own, that all drones' controllers need."""
 
     @property
     def position(self) -> Vector:
@@ -66,11 +66,11 @@ class Controllers:
     (`observation.mount_angles`), which are the body axes for a pair; commands that leave here are in body axes.
     `parameters`: the plant's numbers, if they are not those of `config.plant`.
 
-    On a stand, where a drone's estimator invents motion along what is locked, neither law is fed it: position and
-    velocity across, pitch, yaw and their rates are 0.
+    On a stand, where a drone's estimator invents motion along what is locked, neither controller is fed it: position
+    and velocity across, pitch, yaw and their rates are 0.
 
     `integral` (..., 3) of the leader's error [m s] is followed by that of the stick's angle error [rad s] where the
-    residual is on the PID law: two drones with integrals of their own wind up against each other, for only the
+    residual is on the PID controller: two drones with integrals of their own wind up against each other, for only the
     whole lift and the whole moment show in the motion. The leader's PID is then both drones' base, and what keeps
     turning the stick is lifted away, one drone more, the other less, instead of being held by a lasting roll command.
     Behind them stands the average (..., 3) of what the network adds to that base (`WASHOUT_TIME`): it is taken
@@ -187,7 +187,7 @@ class Controllers:
     ) -> Integral:
         """`integral` one `period` [s] on, in which its error was that at `state`.
 
-        `on_pid`, if given: 1 where the follower flies on it too, 0 where it flies a law of its own.
+        `on_pid`, if given: 1 where the follower flies on it too, 0 where it flies a controller of its own.
         `follower_command`: what a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()
@@ -205,7 +205,7 @@ class Controllers:
         level = clipped(integral[..., 3:4] + period * off, -most, most)
         average = integral[..., 4:]
         if follower_command is not None:
-            # What was added is what was flown above the base, which is the leader's law, and what was taken off.
+            # What was added is what was flown above the base, which is the leader's controller, and what was taken off.
             base = self._with_lift_difference(self._pid_command(state, goal, integral), integral, -self._lift_sign)
             average = average + period / WASHOUT_TIME * (follower_command - base)
         if on_pid is not None:
@@ -218,7 +218,7 @@ class Controllers:
         return wanted if not self._on_pid else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
 
     def follower_command(self, command: Vector, integral: Integral) -> Vector:
-        """A network's `command` in body axes, which holds the PD law, with its share of the integrals if it has one."""
+        """A network's `command` in body axes, which includes the PD controller's, with its share of the integrals if any."""
         if not self._on_pid:
             return command
         xp, controller = command.__array_namespace__(), self._controller

@@ -175,7 +175,7 @@ class _Together:
             if hasattr(follower, "step") and not hasattr(follower, "reset"):
                 name = type(follower).__name__
                 raise InputError(
-                    f"{name} is a law; mjxball.control.followers.Baseline({name}(config), config) flies it"
+                    f"{name} is a controller; mjxball.control.followers.Baseline({name}(config), config) flies it"
                 )
             follower.reset()
         # 1 for every flight of a policy, whose base is the leader's whole PID; 0 for one of a baseline.

@@ -54,7 +54,9 @@ def train(
             "train() is traced, by jax.jit or jax.vmap, and cannot show its progress: leave on_progress out"
         )
     if on_progress and not callable(on_progress) and not in_notebook():
-        raise InputError("train(on_progress=True) draws in a notebook; elsewhere give a function that is told the rows")
+        raise InputError(
+            "train(on_progress=True) draws in a notebook; elsewhere give a function that is called with the rows"
+        )
     if on_progress is None:
         on_progress = in_notebook() and not traced
     report = on_progress if callable(on_progress) else LiveCurve(f"training {config.preset}") if on_progress else None

@@ -131,7 +131,7 @@ class Progress:
             self._log({name: value for name, value in row.items() if value is not None})
         except FOREIGN as error:  # any error of the user's program
             self._log = None
-            self.say(f"warning: --tracker raised {said(error)}; it is told no more rows")
+            self.say(f"warning: --tracker raised {said(error)}; it gets no more rows")
 
     def _lines(self) -> list[list[str]]:
         """Current lines of the status, each a list of phrases."""

@@ -143,7 +143,7 @@ static void turn(float *vectors, int count, float c, float s) {
 #endif
 #endif
 
-/* Controllers, as in sim/laws.py. */
+/* Controllers, as in sim/controllers.py. */
 
 static void clip_command(float *command) {
     for (int i = 0; i < 3; i++) command[i] = clip(command[i], -mjxball_limit[i], mjxball_limit[i]);

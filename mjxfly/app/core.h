@@ -73,7 +73,7 @@ typedef struct {
     float mount_frame[2];  /* cosine and sine of the angle about body z by which the policy's axes are rotated */
 #endif
     float carried[2];      /* nominal mass that each drone lifts [kg] */
-    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain; /* the leader's controller, see sim/laws.py */
+    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain; /* the leader's controller, see sim/controllers.py */
     int axis;              /* of the load's moment: 0 roll, 1 pitch */
     float lift_sign;       /* sign of the rotation about the axis if the leader lifts more */
     int shares;            /* the follower adds to the leader's PID, whose integrals it receives */

@@ -176,7 +176,7 @@ CUTOFF = np.array([30.0] * 3 + [80.0] * 3)  # [Hz] of accelerometer and gyroscop
 # Standard deviations of one sample with motors running and at rest: [m/s2] and [rad/s].
 RUNNING = np.array([0.3] * 3 + [math.radians(0.5)] * 3)
 RESTING = np.array([0.03] * 3 + [math.radians(0.05)] * 3)
-BLOCK = 1000  # samples of noise that are drawn at once
+BLOCK = 1000  # samples of noise taken at once
 
 
 class Imu:
@@ -203,8 +203,8 @@ class Imu:
         """One millisecond on: `true` (2, 6), whose motors are `running` (2, 1); returns what the firmware sees."""
         if self._noise:
             if self._at >= BLOCK:
-                self._drawn, self._at = self._noise * self._random.standard_normal((BLOCK, 2, 6)), 0
-            true = true + np.where(running, RUNNING, RESTING) * self._drawn[self._at]
+                self._samples, self._at = self._noise * self._random.standard_normal((BLOCK, 2, 6)), 0
+            true = true + np.where(running, RUNNING, RESTING) * self._samples[self._at]
             self._at += 1
         out = self._b0 * true + self._first
         self._first = self._b1 * true - self._a1 * out + self._second

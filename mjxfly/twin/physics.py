@@ -159,7 +159,7 @@ class SimplePair:
 def make_pair(
     metadata: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, surroundings: Surroundings = QUIET
 ) -> Pair:
-    """Return the physics of the rig in a policy's metadata `card`; without it, the default `SimplePair`."""
+    """Return the physics of the rig in a policy's `metadata`; without it, the default `SimplePair`."""
     return (
         SimplePair(kind=kind, surroundings=surroundings)
         if metadata is None

@@ -49,7 +49,7 @@ def test_a_cell_is_that_of_flax() -> None:
 
 
 def test_training_and_file_answer_alike(recurrent: Recurrent) -> None:
-    """In flight after flight: action, state and command of the network in training, the batch law and `Policy`."""
+    """In every flight: action, state and command of the network in training, the batch controller and `Policy`."""
     env = TransportEnv(recurrent.config, "newton-euler")
     policy, exact = Policy(recurrent.contents, "one"), Policy(recurrent.contents, "one", np.float64)
     controller = NetworkController(exact)

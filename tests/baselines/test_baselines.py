@@ -172,7 +172,7 @@ def test_reference_scenario_is_the_first_cell(cells) -> None:
 
 
 def test_observer_integrals_and_mpc_take_off_a_torque_and_a_mass_that_nobody_told() -> None:
-    """A load at rest at 3 cm, 0.3 kg believed 0.2 kg: the PD law alone stays away."""
+    """A load at rest at 3 cm, 0.3 kg believed 0.2 kg: the PD controller alone stays away."""
     config, offset_free = preset("paper"), ("observer", "pid", "mpc")
     scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=0.03, mass=0.3, believed_mass=0.2, seconds=45.0)
     names = ("copy", *offset_free)
@@ -183,7 +183,7 @@ def test_observer_integrals_and_mpc_take_off_a_torque_and_a_mass_that_nobody_tol
 
 
 def test_the_observer_sees_a_step_of_torque_and_of_lift_by_its_time_constants() -> None:
-    """1 - (1 - w T)^k of it after k periods T, whatever the law itself commands."""
+    """1 - (1 - w T)^k of it after k periods T, whatever the controller itself commands."""
     config = preset("paper")
     controller, pair, observation = make_controller("observer", config), assembly_model(config, "test"), np.zeros(18)
     bandwidth = np.array([controller.gains.torque_bandwidth, controller.gains.lift_bandwidth])

@@ -1,4 +1,4 @@
-"""The linear motion that all laws of the family share."""
+"""The linear motion that all controllers of the family share."""
 
 from __future__ import annotations
 

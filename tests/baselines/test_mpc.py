@@ -67,7 +67,7 @@ def cost(own: MpcDesign, x: np.ndarray, corrections: np.ndarray) -> float:
 
 
 def test_a_correction_costs_its_square_on_top_of_the_lqr() -> None:
-    """J = x'Px + sum of W v^2: without limits the best v is none, and the law the LQR."""
+    """J = x'Px + sum of W v^2: without limits the best v is none, and the controller the LQR."""
     own, random = controller(), np.random.default_rng(0)
     x, corrections = np.zeros(PAIR_STATES), 0.1 * random.normal(size=20)
     x[[EX, VX, PITCH]] = 0.4, -0.2, 0.05
@@ -100,7 +100,7 @@ def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
 
 @rows("drones", [3, 6])
 def test_the_plan_expects_what_a_turned_team_does(drones: int) -> None:
-    """Roll and pitch of a ring are one law, turned, but for what uneven lifts turn: the leader is along x."""
+    """Roll and pitch of a ring are one controller, turned, but for what uneven lifts turn: the leader is along x."""
     own = make_controller("mpc", ring_config(TEAM, drones)).designs[drones]
     along, across = [EX, VX, PITCH, PITCH_RATE, TORQUE], [EY, VY, ROLL, ROLL_RATE, ROLLING]
     signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])  # pitch nose down drives along +x, roll along -y

@@ -20,7 +20,7 @@ from mjxball.physics.step import hover_rotor_force, make_stepper
 from mjxball.sim.rollout import load_of, simulate_batch, start_of
 from mjxball.sim.scenario import Scenario
 
-# With the older curve, whose bend the laws know of, and a leader whose integrals are its own.
+# With the older curve, whose bend the controllers know of, and a leader whose integrals are its own.
 FLIGHT = apply_overrides(
     with_curve(preset("flight"), OLDER),
     {

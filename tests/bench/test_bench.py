@@ -41,7 +41,7 @@ class Good:
     def __init__(self, config): self.calls = 0
     def reset(self): self.calls = 0
     def __call__(self, observation): return np.zeros((*observation.shape[:-1], 3))
-class Law:
+class Controller:
     needs_privileged = False
     def __init__(self, config): pass
     def start(self, observation): return ()
@@ -151,7 +151,7 @@ def in_full(value: Any) -> Text:
 
 
 def fingerprint(worlds: list[World]) -> str:
-    """Of all plants, laws and flights."""
+    """Of all plants, controllers and flights."""
     parts = []
     for world in worlds:
         named = ("plant", "attitude", "autopilot", "leader", "command", "timing")

@@ -1,4 +1,4 @@
-"""What policies are good for by their cards, and flights longer than anybody looked at before."""
+"""What policies are good for by their metadata, and flights longer than anybody looked at before."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_evaluation_and_the_viewer_warn_of_it(tmp_path: Path, capsys: pytest
     for plant, expected in (("team4", 1), ("team3", 0)):
         assert call(evaluate.main, [policy, *short, plant]) == 0
         assert call(view.main, [policy, *short, plant, "--out", tmp_path / f"{plant}.html"]) == 0
-        warnings = [line for line in capsys.readouterr().err.splitlines() if "by its card" in line]
+        warnings = [line for line in capsys.readouterr().err.splitlines() if "by its metadata" in line]
         assert len(warnings) == 2 * expected
         assert all(line.startswith("warning: ") and "2, 3 drones" in line for line in warnings)
     load_policy(policy, plant_setup(Path("team3")), seconds=61.0)
@@ -64,7 +64,7 @@ def test_the_evaluation_and_the_viewer_warn_of_it(tmp_path: Path, capsys: pytest
 
 
 def test_cards_say_what_was_measured() -> None:
-    """Of the lengths up to the card's, its numbers of drones are those all of whose flights were steady."""
+    """Of the lengths up to the metadata's, its numbers of drones are those all of whose flights were steady."""
     measured = json.loads(MEASURED.read_text())["rows"]
     for path in shipped_policies():
         flown, mine = Policy.load(path).metadata["flown"], [row for row in measured if row["policy"] == path.stem]
@@ -90,7 +90,7 @@ def horizon() -> ModuleType:
     "path", [FLIGHT, *weekly(*sorted({*shipped_policies()} - {FLIGHT}))], ids=lambda path: path.stem
 )
 def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
-    """Its load at rest, and moving slowly and quickly: nothing is lost, and what its card is good for stays steady."""
+    """Load at rest, moving slowly and quickly: nothing is lost; what its metadata is good for stays steady."""
     flown = Policy.load(path).metadata["flown"]
     plants = [setup for _, setup in horizon.own_plants(path) if setup.plant.count in flown["drones"]]
     setup = max(plants, key=lambda one: one.plant.count)

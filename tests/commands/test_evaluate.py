@@ -124,7 +124,7 @@ import numpy as np
 
 from mjxball.control.followers import Copy
 
-class Law(Copy):
+class Controller(Copy):
     pass
 
 class Level:

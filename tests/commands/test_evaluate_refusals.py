@@ -116,7 +116,7 @@ DAMAGES: dict[str, tuple[Callable[[dict, dict], None], str]] = {
     "pickle inside": (lambda arrays, metadata: arrays.update(weight_0=np.array([{}], object)), "pickle"),
     "later format": (_in_metadata("format_version", lambda version: version + 1), "format"),
     "format is text": (_in_metadata("format_version", str), "format"),
-    "card field missing": (lambda arrays, metadata: metadata.pop("control_period"), "control_period"),
+    "metadata field missing": (lambda arrays, metadata: metadata.pop("control_period"), "control_period"),
     "another observation": (_in_metadata("observation", lambda slots: [["battery", "V"], *slots[1:]]), "observation"),
     "another order": (_in_metadata("observation", lambda slots: slots[::-1]), "observation"),
     "another unit": (_in_metadata("observation", lambda slots: [[name, "deg"] for name, _ in slots]), "observation"),
@@ -163,7 +163,7 @@ def test_damaged_bytes_are_refused(
 def test_card_that_is_not_json_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arrays, _ = load_arrays()
     np.savez(here / "odd.npz", **arrays | {"card": np.array("{")})
-    assert "card" in refused(here, [*FAST, "odd.npz"], capsys)
+    assert "metadata" in refused(here, [*FAST, "odd.npz"], capsys)
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ CURVE = {
 
 
 def policy_with(**metadata: Any) -> Policy:
-    """The shipped follower with another card, under the name `mine`."""
+    """The shipped follower with another metadata, under the name `mine`."""
     policy = Policy.load(TRANSPORT)
     policy.name, policy.metadata = "mine", {**policy.metadata, **metadata}
     return policy
@@ -130,7 +130,7 @@ def test_reward_table_has_a_row_for_every_policy() -> None:
     bare.name = "bare"
     rows = plot_reward([mimic, bare]).rows
     assert rows[0] == ("mine", "paper", "300", "-900", "-50", "-20")
-    assert rows[1][:2] == ("bare", "no training curve in its card")
+    assert rows[1][:2] == ("bare", "no training curve in its metadata")
 
 
 @pytest.mark.slow

@@ -215,7 +215,7 @@ def test_report_sorts_and_filters(browser, report: Path) -> None:
 def test_report_says_how_it_was_made(report: Path) -> None:
     text = (report / "report.html").read_text()
     assert "python eval.py suites --followers copy adaptive" in text
-    assert "card of <b>transport</b>" in text
+    assert "metadata of <b>transport</b>" in text
     assert "image/webp;base64" in text or "No picture: MuJoCo" in text
 
 

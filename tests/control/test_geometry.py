@@ -83,7 +83,7 @@ def file(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file) -> None:
-    with pytest.raises(InputError, match="told its team"):
+    with pytest.raises(InputError, match="must know its team"):
         Policy.load(file)(np.zeros((2, 18)))
     with pytest.raises(InputError, match="2 to 6 drones, not 8"):
         load_policy(file, ring_config(configs.replace(TEAM, "scenario.team_sizes", ()), 8))

@@ -1,4 +1,4 @@
-"""The leader's PD law (paper eq. 5) and the attitude gains, by hand."""
+"""The leader's PD controller (paper eq. 5) and the attitude gains, by hand."""
 
 import numpy as np
 import pytest

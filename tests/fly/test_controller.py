@@ -1,4 +1,4 @@
-"""The laws in flight are the laws in simulation: same numbers for the same state."""
+"""The controllers in flight are the controllers in simulation: same numbers for the same state."""
 
 from __future__ import annotations
 

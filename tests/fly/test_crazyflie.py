@@ -1,4 +1,4 @@
-"""Flights of both Crazyflie presets on the coupled model: the laws, gains and thrust of the card, in virtual time."""
+"""Flights of both Crazyflie presets on the coupled model, in virtual time: controllers, gains, thrust of the metadata."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
     )
     assert (abs(commands.leader[2] - apart - lift - config.leader.ki[2] * integrated) > 1e-3) == own
     # What lifts apart has moved on by one tick. The network says nothing:
-    # the follower's command is the PD law on what it observes, or the leader's own.
+    # the follower's command is the PD controller on what it observes, or the leader's own.
     limit = config.command.vertical_limit
     base = commands.leader[2] - 2 * apart if config.follower.residual_on_pid else np.clip(lift, -limit, limit)
     assert commands.follower[2] == pytest.approx(base, abs=5e-3 if apart else 1e-5)

@@ -87,7 +87,7 @@ def test_the_first_enabled_robot_leads_and_the_second_follows(tmp_path: Path) ->
 
 
 def test_a_robots_parameters_come_before_its_types_and_these_before_all(tmp_path: Path) -> None:
-    """Only those of positioning and estimator: laws, gains and setpoints are the flight's own."""
+    """Only those of positioning and estimator: controllers, gains and setpoints are the flight's own."""
     leader, follower = read_pair(written(tmp_path, FILE)).parameters
     assert leader == {"kalman.pNAcc_xy": 0.7, "kalman.pNAcc_z": 0.9, "locSrv.extPosStdDev": 1e-3}
     assert follower == {**leader, "kalman.pNAcc_xy": 0.6}

@@ -67,7 +67,7 @@ def test_two_flights_in_a_row_need_no_reboot() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("curve", ["older", *weekly("linear", "cubic")])
 def test_either_firmware_is_recognised_and_flown_alike(curve: str) -> None:
-    """Defects 3, 4: a card for one force curve crashed on the other. 20 mm is what the issue asks of either."""
+    """Defects 3, 4: metadata for one force curve crashed on the other. 20 mm is what the issue asks of either."""
     world = world_of("flight", 6.0, curve, delay=0.005)
     world.run(60.0)
     assert world.flight.supervisor.cause is None
@@ -77,7 +77,7 @@ def test_either_firmware_is_recognised_and_flown_alike(curve: str) -> None:
 
 
 def pushed(world: VirtualTwin, monkeypatch: pytest.MonkeyPatch, *vertical: float) -> None:
-    """Have both laws ask for `vertical` accelerations [m/s2] by turns."""
+    """Have both controllers ask for `vertical` accelerations [m/s2] by turns."""
     flight, turns = world.flight, itertools.cycle(vertical)
     step = flight.controller.step
 
@@ -131,7 +131,7 @@ def test_a_pair_too_heavy_for_its_firmware_is_refused_before_the_ramp() -> None:
 
 @pytest.mark.slow
 def test_the_stand_keeps_its_ball_under_the_estimators_sideways_motion() -> None:
-    """Defect 5: fed sideways positions that do not exist, both laws lost the ball from 4 cm."""
+    """Defect 5: fed sideways positions that do not exist, both controllers lost the ball from 4 cm."""
     policy = Policy.load(shipped_policy("stand"))
     conditions = dataclasses.replace(Conditions.of(FlightController(policy).config), ball=0.03)
     world = world_of("stand", 15.0, conditions=conditions)

@@ -29,7 +29,7 @@ G = 9.81
 
 
 def hovering(seconds: float = 20.0, height: float = HEIGHT, flown: float = 3.0) -> VirtualTwin:
-    """The pair of `flight`, `flown` seconds under both laws."""
+    """The pair of `flight`, `flown` seconds under both controllers."""
     pytest.importorskip("mujoco")
     settings = FlightSettings(seconds, (0.0, 0.0, height))
     world = VirtualTwin(Policy.load(FLIGHT), settings, log=MemoryLog(False), settle=1.0)

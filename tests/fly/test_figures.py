@@ -1,4 +1,4 @@
-"""Figures of a flight under both laws."""
+"""Figures of a flight under both controllers."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def test_a_flight_from_start_to_end() -> None:
     world.fly_until(FlightState.FLY)
     world.fly_for(4.9)
     there = world.state.position.mean(axis=0)
-    # The policy's card promises to settle within 2.8 s, but for another plant; 5 cm shows that signs are right.
+    # The policy's metadata promises to settle within 2.8 s, but for another plant; 5 cm shows that signs are right.
     np.testing.assert_allclose(there, [0.2, -0.1, 0.5], atol=0.05)
     world.fly_until(FlightState.DONE)
     assert world.log.transitions() == NORMAL
@@ -227,7 +227,7 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
         raise OSError("no log")
 
     world.flight.supervisor, world.flight.watchdog, world.flight.note = Supervisor(FlightState.FLY), None, note
-    with pytest.raises(Ended):  # the laws on board: nobody else takes over, and the apps land
+    with pytest.raises(Ended):  # the controllers on board: nobody else takes over, and the apps land
         session.run(world.flight)
     assert "the apps on board land both drones" in capsys.readouterr().err
 

@@ -50,7 +50,7 @@ def drone(x: float, rates: float = 0.0) -> DroneState:
 
 
 def write(path: Path, seconds: float = 2.0, **header: Any) -> list[bytes]:
-    """A log of a second of ramp and `seconds` under both laws, every state another; its lines."""
+    """A log of a second of ramp and `seconds` under both controllers, every state another; its lines."""
     with Journal(path, **{**HEADER, **header}) as log:
         for number in range(round(100 * (1 + seconds))):
             for name, x in (("leader", 0.15), ("follower", -0.15)):

@@ -79,7 +79,7 @@ def test_csv_and_parquet_hold_the_flight(log: Path, flight: Recording, tmp_path:
         rows = list(csv.DictReader(stream))
     np.testing.assert_allclose([float(row["z"]) for row in rows], flight.position[:, 2])
     assert [row["phase"] for row in rows] == list(flight.phase)
-    assert rows[0]["leader_roll"] == ""  # no law was in command
+    assert rows[0]["leader_roll"] == ""  # no controller was in command
     parquet = pytest.importorskip("pyarrow.parquet")
     assert call(main, [log, tmp_path / "flight.parquet"]) == 0
     columns = parquet.read_table(tmp_path / "flight.parquet").to_pydict()

@@ -205,7 +205,7 @@ HOVER = FlightSettings(seconds=30.0)
 
 
 def hovering(world: VirtualTwin, seconds: float) -> VirtualTwin:
-    """`world` in the air, `seconds` after the laws took over at the goal."""
+    """`world` in the air, `seconds` after the controllers took over at the goal."""
     config, place = FlightController(FLIGHT).config, [np.array([0.0, 0.0, 0.4]), np.zeros(3), np.zeros(3)]
     world.start_in_air(start_state(config, *place, np.float64(world.pair.conditions.object_mass), np.float64(0.0)))
     world.fly_for(seconds)

@@ -22,7 +22,7 @@ def refused(name: str, leader: Gains, follower: Gains) -> str:
 
 
 def own(name: str) -> tuple[Gains, Gains]:
-    """The card's gains."""
+    """The metadata's gains."""
     return pair_gains(FlightController(Policy(load_policy(shipped_policy(name)), name)).config.autopilot)
 
 

@@ -115,7 +115,7 @@ def test_gains_and_poses_come_before_the_reset(measured: bool) -> None:
 
 
 def test_another_programs_controller_is_replaced() -> None:
-    """By the PID for the laptop's laws, and by the app's own, which is handed the state, for laws on board."""
+    """By the PID for the laptop's controllers; for those on board by the app's own, which is handed the state."""
     for on_board, wanted in ((False, 1.0), (True, 6.0)):
         drones = [Drone("leader"), Drone("follower")]
         prepare(drones, [OWN, OWN], ASKED, print, None, (lambda number, link: None) if on_board else None)

@@ -79,7 +79,7 @@ def test_the_goal_is_shown_as_it_was_before_the_landing(recording: Recording) ->
 
 
 def test_the_same_commands_fly_the_same_way(recording: Recording) -> None:
-    """The recorded setpoints alone, with no law that sees where it is, end where the flight ended."""
+    """The recorded setpoints alone, with no controller that sees where it is, end where the flight ended."""
     again = simulate_setpoints(recording, OLDER)
     # Setpoints take effect within a tick; 6 s later that has grown to a centimetre or two.
     np.testing.assert_allclose(again.position, recording.position, atol=0.03)
@@ -91,7 +91,7 @@ def test_the_same_commands_fly_the_same_way(recording: Recording) -> None:
 
 
 def test_a_flight_is_what_the_pure_simulation_says(recording: Recording) -> None:
-    """Position and roll of the flight under both laws within 20 % of the simulation's, which lifts off in the air."""
+    """Position and roll of the flight under both controllers within 20 % of the simulation's, which starts in the air."""
     config, met = recording.config, Conditions.of(recording.config)
     rows = [number for number, phase in enumerate(recording.phase) if phase == "fly"]
     begun = recording.time[rows[0]]

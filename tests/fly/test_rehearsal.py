@@ -161,7 +161,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def flies(log: Path, process: subprocess.Popen[str]) -> bool:
-    """Wait for the laws to take over; false if the flight ends before."""
+    """Wait for the controllers to take over; false if the flight ends before."""
     while process.poll() is None:
         if log.exists() and '"after": "fly"' in log.read_text(encoding="utf-8"):
             return True

@@ -1,4 +1,4 @@
-"""The command map: the paper's thrust law, the calibrated one, and bounds."""
+"""The command map: the paper's thrust controller, the calibrated one, and bounds."""
 
 from __future__ import annotations
 

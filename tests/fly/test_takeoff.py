@@ -41,7 +41,7 @@ def check_that_the_stand_keeps(ball: float, **around) -> None:
     world = world_of("stand", 3.0, ball, **around)
     world.fly_until(FlightState.FLY)
     share, height = world.config.plant.moving_fraction, world.state.position[:, 2] - world.rest
-    assert height.min() > 0.03  # both sides, of 0.04 m of O at which the laws take over
+    assert height.min() > 0.03  # both sides, of 0.04 m of O at which the controllers take over
     # 4.4 mN m of the ball are half of what both drones' rotors alone can hold: level means less than a degree or so.
     assert max(abs(moment.roll) for moment in world.track) < math.radians(1.5)
     world.fly_for(2.9)
@@ -51,7 +51,7 @@ def check_that_the_stand_keeps(ball: float, **around) -> None:
 
 @pytest.mark.slow
 def test_a_ball_on_the_leaders_side_lifts() -> None:
-    """It stood, the follower at its lower bound: laws that command a side on its legs see no answer."""
+    """It stood, the follower at its lower bound: controllers that command a side on its legs see no answer."""
     check_that_the_stand_keeps(0.06)
 
 
@@ -85,8 +85,8 @@ def test_free_flights_begin_where_the_pair_stood(name: str, around: dict) -> Non
 
 @pytest.mark.slow
 def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
-    """Gains -8/+8 %: 215 mm sideways and 4.6 degrees, since the laws began with equal thrusts; with the load's CG at
-    its far end the pair was lost. What remains is the 35 mm that gains alike have, and the ramp's own 20 mm.
+    """Gains -8/+8 %: 215 mm sideways and 4.6 degrees, since the controllers began with equal thrusts; with the load's
+    CG at its far end the pair was lost. What remains is the 35 mm that gains alike have, and the ramp's own 20 mm.
     """
     for gains in ((0.92, 1.08), (1.08, 0.92), (0.95, 1.05)):
         world = world_of("flight", 4.0, gains=gains, delay=0.005)
@@ -99,7 +99,7 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
 
 @pytest.mark.slow
 def test_attitudes_that_disagree_are_not_taken_for_motors_that_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each drone pushes its end to where it sees itself level: 35 - 46 degrees where the laws went on from there."""
+    """Each drone pushes its end to where it sees itself level: 35 - 46 degrees where controllers went on from there."""
     rolls = [rotations.quaternion_from_euler(np.array([math.radians(roll), 0.0, 0.0])) for roll in (1.5, -1.5)]
     true = avionics.OnboardComputers._attitude
     monkeypatch.setattr(
@@ -173,7 +173,7 @@ def test_a_side_that_stays_down_in_the_air_is_lifted_apart_and_a_floor_that_slop
 
 
 def test_what_holds_the_stick_level_is_what_hovers() -> None:
-    """The integral of 1 degree over 0.2 s; a load's place and, on a stand, a ball's are the laws' own."""
+    """The integral of 1 degree over 0.2 s; a load's place and, on a stand, a ball's are the controllers' own."""
     for stand, degrees, taken in ((False, 1.0, True), (False, 0.5, False), (True, 1.0, False)):
         one = TakeOff(RIG, Times(), PERIOD, 0.05, stand)
         for now in np.arange(0.0, Times().ramp * BEGIN + 0.2, PERIOD):

@@ -34,7 +34,7 @@ def audit(event, arguments):
         found.append([world.flight.supervisor.state.value, event])
 
 policy = Policy.load(shipped_policy("flight"))
-rig = Rig.from_metadata(policy.card)
+rig = Rig.from_metadata(policy.metadata)
 physics = SimplePair(SimplePlant(mass=0.07, mounts=(rig.leader_mount, rig.follower_mount)))
 world = VirtualTwin(policy, FlightSettings(seconds=1.0), physics=physics)
 tick = world.flight.tick

@@ -90,7 +90,7 @@ def test_a_mass_change_is_impulse_free() -> None:
     np.testing.assert_array_equal(changed.velocity[until], plain.velocity[until])
     assert (changed.object_mass[~until] == 0.4).all()
     # The heavier object sinks: 0.2 kg x g unsupported on 2.4 kg is 0.82 m/s2, one second later about that fast,
-    # less what the PD law regained.
+    # less what the PD controller regained.
     assert -0.9 < changed.velocity[-1, 2] - plain.velocity[-1, 2] < -0.4
 
 

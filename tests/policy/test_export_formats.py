@@ -73,7 +73,7 @@ def direct(trained: Trained) -> PolicyFile:
 
 @pytest.fixture(scope="module")
 def limited(remembering: Trained) -> PolicyFile:
-    """A follower with everything that it can remember, whose PD law differs on every axis and meets its limits."""
+    """A follower with all that it can remember, whose PD controller differs on every axis and meets its limits."""
     metadata = {**remembering.contents.metadata, "leader_kp": [0.5, 0.7, 0.9], "leader_kd": [1.0, 1.2, 1.4]}
     return dataclasses.replace(remembering.contents, metadata={**metadata, "command_limits": [0.05, 0.6]})
 
@@ -277,13 +277,13 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("follower.npz", "taken.h", "taken.h exists"),
         ("follower.npz", "nowhere/follower.h", "nowhere does not exist"),
         ("none.npz", "follower.h", "none.npz does not exist"),
-        ("broken.npz", "follower.onnx", "broken.npz: card field history is missing"),
+        ("broken.npz", "follower.onnx", "broken.npz: metadata field history is missing"),
         ("no-run", "follower.onnx", "no-run"),
-        ("follower.npz", "a.h --plant team4", "is told nothing of its team"),
-        ("universal.npz", "a.h", "has to be told its team: --plant NAME"),
+        ("follower.npz", "a.h --plant team4", "knows nothing of its team"),
+        ("universal.npz", "a.h", "must know its team: --plant NAME"),
         ("universal.npz", "a.onnx --plant team4", "--drone must be a follower of --plant: 1, 2, 3"),
         ("universal.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),
-        ("universal.npz", "a.onnx --drone 1", "has to be told its team: --plant NAME"),
+        ("universal.npz", "a.onnx --drone 1", "must know its team: --plant NAME"),
         ("older.npz", "a.h --plant team4 --drone 1", "has policy format 3, a network on top of an LQG"),
         ("universal.npz", "a.npz --plant nothing", "plant file nothing does not exist"),
     ],

@@ -202,7 +202,7 @@ def test_another_number_of_flights_is_refused_before_a_reset() -> None:
     team = Policy(load_file(shipped_policy("universal")), "universal")
     team.join(plant_setup(Path("team3")).plant)
     for shape in ((), (3,), (2, 4)):
-        with pytest.raises(InputError, match="told of 2 followers"):
+        with pytest.raises(InputError, match="joined a team of 2 followers"):
             team(np.zeros((*shape, 18)))
     assert team(np.zeros((3, 2, 18))).shape == (3, 2, 3)
 

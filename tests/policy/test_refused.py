@@ -51,7 +51,7 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def rewrite_metadata(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Save the card of `path` again after `change`."""
+    """Save the metadata of `path` again after `change`."""
     metadata = json.loads(str(arrays_of(path)["card"]))
     change(metadata)
     rewrite(path, lambda arrays: arrays.update({"card": np.array(json.dumps(metadata))}))
@@ -204,7 +204,7 @@ class TestDamagedArrays:
         refused(saved, name)
 
     def test_action_without_range(self, saved):
-        """The card and the array agree that roll and pitch have a range of 0."""
+        """The metadata and the array agree that roll and pitch have a range of 0."""
         rewrite_metadata(saved, lambda metadata: metadata.update(action_reach=[0.0, metadata["action_reach"][1]]))
         rewrite(saved, lambda arrays: np.put(arrays["action_scale"], [0, 1], 0.0))
         refused(saved, "action_scale must be positive")

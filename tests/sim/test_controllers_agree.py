@@ -1,4 +1,4 @@
-"""One law, one home: every function in `control/` gives the same on NumPy and on JAX."""
+"""One controller, one home: every function in `control/` gives the same on NumPy and on JAX."""
 
 import inspect
 from collections.abc import Callable
@@ -72,7 +72,7 @@ CASCADE = (
     0.1 * normal(3),
 )
 
-# name -> (law of arrays alone, its arrays). Clipping happens in some worlds and not in others.
+# name -> (controller of arrays alone, its arrays). Clipping happens in some worlds and not in others.
 CONTROLLERS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.rotate": (rotations.rotate, (MATRIX, normal(3))),
     "rotations.rotate_back": (rotations.rotate_back, (MATRIX, normal(3))),

@@ -244,7 +244,9 @@ class TestUniversal:
     @pytest.mark.slow
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
         load_policy(POLICY, with_plant(preset("transport"), "team4"))
-        assert "trained from" not in capsys.readouterr().err  # more drones than its card is good for, but of its ranges
+        assert (
+            "trained from" not in capsys.readouterr().err
+        )  # more drones than its metadata is good for, but of its ranges
         paper = preset("paper")
         load_policy(POLICY, paper)
         assert capsys.readouterr().err == ""

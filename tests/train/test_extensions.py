@@ -62,7 +62,7 @@ def test_an_environment_of_ones_own_is_traced_once(small: Config, monkeypatch: p
 
 @pytest.mark.slow
 def test_any_brax_environment_trains(small: Config) -> None:
-    """From pushing at random to standing at 0: the return of 60 steps is about -1.5 for the optimal law."""
+    """From pushing at random to standing at 0: the return of 60 steps is about -1.5 for the optimal controller."""
     policy, metrics = jax.jit(lambda key: train(small, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(0))
     assert metrics["eval_return"].shape == metrics["alpha"].shape == (3,)
     assert metrics["eval_return"][-1] > -8.0

@@ -1,4 +1,4 @@
-"""Trackers of others: they are told every row of metrics.csv, and cannot end a training."""
+"""Trackers of others: they get every row of metrics.csv, and cannot end a training."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_every_row_is_told_and_a_failing_tracker_ends_nothing(here: Path, capsys
     my_tracker.told.clear()
     assert main([*SHORT[:-1], "second", "--tracker", "my_tracker:failing"]) == 0
     assert len(my_tracker.told) == 1
-    assert "--tracker raised OSError: no network; it is told no more rows" in capsys.readouterr().err
+    assert "--tracker raised OSError: no network; it gets no more rows" in capsys.readouterr().err
     assert (here / "second/policy.npz").exists()
 
 

@@ -84,7 +84,7 @@ def test_a_run_directory_and_a_baseline_are_flown(flight: Flight, tmp_path: Path
 
 
 def test_a_law_of_ones_own_is_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "own_view.py").write_text("from mjxball.control.followers import Copy\nclass Law(Copy): pass\n")
+    (tmp_path / "own_view.py").write_text("from mjxball.control.followers import Copy\nclass Controller(Copy): pass\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     own, ours = (flight_from(name, {"seconds": 1.0}, "newton-euler") for name in ("own_view:Law", "copy"))

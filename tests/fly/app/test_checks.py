@@ -29,7 +29,7 @@ LIMIT, LEAST, MOST = 15.001, 10001, 60000  # [deg], [thrust units] of what is se
 
 @functools.cache
 def taken_off(name: str = "flight") -> Bench:
-    """A pair in the first period of its laws."""
+    """A pair in the first period of its controllers."""
     bench = Bench(cores_of(name), Rig.from_metadata(policy_of(name).metadata))
     bench.take_off()
     assert bench.phases == [AppPhase.FLY] * 2
@@ -208,7 +208,7 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
 @needs_gcc
 @rows("name", ["recurrent flight", "universal"])
 def test_a_state_of_the_network_that_is_not_finite_lands_the_pair(name: str):
-    """The law of `copy` flies on from the same period; what cannot be is forgotten."""
+    """The controller of `copy` flies on from the same period; what cannot be is forgotten."""
     size = controller_of(policy_of(name).metadata).size
     for value in (math.nan, math.inf, -math.inf):
         bench = flying(name)

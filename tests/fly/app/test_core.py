@@ -1,4 +1,4 @@
-"""Followers on board: the apps' C against the laptop's laws, and what it refuses or ends."""
+"""Followers on board: the apps' C against the laptop's controllers, and what it refuses or ends."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mjxfly.telemetry import ObjectState, Rig
 @needs_gcc
 @pytest.mark.parametrize("name", ["flight", "stand", "recurrent flight", "universal"])
 def test_the_apps_command_what_the_laptop_would(name: str):
-    """Leader and follower over 5 s of motion: float32 on board, float64 laws on the laptop."""
+    """Leader and follower over 5 s of motion: float32 on board, float64 controllers on the laptop."""
     policy = policy_of(name)
     bench = Bench(cores_of(name), Rig.from_metadata(policy.metadata))
     controller = FlightController(Policy(policy, name))
@@ -31,7 +31,7 @@ def test_the_apps_command_what_the_laptop_would(name: str):
     goal = np.array([0.0, 0.0, 0.4 if free else 0.08])
     random, euler = np.random.default_rng(0), np.zeros(3)
     position, velocity, rates = np.zeros(3), np.zeros(3), np.zeros(3)
-    bench.take_off()  # the last period was one of the laws', at rest
+    bench.take_off()  # the last period was one of the controllers', at rest
     controller.step(AT_REST, goal)
     worst, spread = np.zeros(6), np.zeros(6)
     for number in range(500):  # noqa: B007
@@ -165,7 +165,7 @@ def test_one_abort_lands_both():
 
 @needs_gcc
 def test_nobody_lands_who_has_not_flown():
-    """An order to land stops motors that spin; on a ramp it ends in the descent, which needs no law."""
+    """An order to land stops motors that spin; on a ramp it ends in the descent, which needs no controller."""
     for periods, phase in ((3, AppPhase.STOP), (50, AppPhase.DESCEND)):
         bench = Bench(cores_of(), Rig.from_metadata(policy_of("flight").metadata))
         for number in range(periods):

@@ -64,7 +64,7 @@ def test_the_apps_land_without_a_laptop():
 @pytest.mark.slow
 @pytest.mark.parametrize("ball", [-0.06, *weekly(0.06)])
 def test_a_ball_at_either_end_is_lifted_and_kept(ball: float):
-    """By the clock the law took over on the ground, and one of these never left it."""
+    """By the clock the controller took over on the ground, and one of these never left it."""
     policy = Policy.load(shipped_policy("stand"))
     config = FlightController(policy).config
     conditions, most = replace(Conditions.of(config), ball=ball), config.plant.moving_fraction * config.plant.ball_stop
@@ -82,7 +82,7 @@ def test_a_ball_at_either_end_is_lifted_and_kept(ball: float):
 @needs_gcc
 @pytest.mark.slow
 def test_motors_that_give_less_on_one_side_do_not_push_it_away():
-    """As on the laptop: 175 mm sideways where the law began with equal thrusts."""
+    """As on the laptop: 175 mm sideways where the controller began with equal thrusts."""
     twin = world(seconds=3.0, gains=(0.92, 1.08))
     twin.fly_until(Laptop.FLY)
     twin.fly_for(2.5)

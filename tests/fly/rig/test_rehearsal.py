@@ -53,7 +53,7 @@ class Case(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Under both laws."""
+        """Under both controllers."""
         return 9.0 if self.goals else 6.0
 
 
@@ -253,7 +253,7 @@ def test_log_and_arrays_tell_the_same(logs: dict[str, Path], tmp_path: Path) -> 
     assert count > 5 / 0.002
     guided = [record["t"] for record in read(path) if record["kind"] == "tick" and record["state"] == "fly"]
     used = np.flatnonzero(flown.usable)
-    # The ramp is not used, to a tick; both laws take over off the ground.
+    # The ramp is not used, to a tick; both controllers take over off the ground.
     assert begin - 5 <= used[0] < begin + 1000
     assert used[-1] <= begin + (guided[-1] - guided[0]) / 0.002 + 10  # nor the landing
 
@@ -294,7 +294,7 @@ def test_gaps_and_frozen_states_are_left_out(
 
 
 def on_other_clocks(path: Path, out: Path, late: dict[str, float], faster: dict[str, float]) -> Path:
-    """The log whose drones' states are `late` [s], by clocks that are `faster` from where both laws take over."""
+    """The log whose drones' states are `late` [s], by clocks `faster` from where both controllers take over."""
     lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     start = next(one["t"] for one in lines if one["kind"] == "tick" and one["state"] == "fly")
     for one in lines:

@@ -30,7 +30,7 @@ OLDER = drone_kind(curve="older")
 def pair_of(
     config: Config, conditions: Conditions | None = None, kind: DroneKind = OLDER, around: Surroundings = EXACT
 ) -> CoupledPair:
-    """A pair whose gains are those of the card."""
+    """A pair whose gains are those of the metadata."""
     pair = CoupledPair(config, conditions, kind, around)
     for drone, gains in enumerate(pair_gains(config.autopilot)):
         for name, value in gains.items():
@@ -124,7 +124,7 @@ def overshoot(pair: CoupledPair, config: Config) -> float:
 
 
 def test_uploaded_gains_matter() -> None:
-    """Stock gains on a stick that makes roll 50 times heavier swing; those of the card do not."""
+    """Stock gains on a stick that makes roll 50 times heavier swing; those of the metadata do not."""
     config = configs.preset("flight")
     still = Conditions(config.plant.object_mass)
     assert overshoot(CoupledPair(config, still, OLDER, EXACT), config) > 0.5

@@ -143,7 +143,7 @@ def test_laws_on_board_need_the_apps_own_controller(monkeypatch: pytest.MonkeyPa
 
 @needs_gcc
 def test_the_controller_that_another_flight_left_is_replaced() -> None:
-    """Laws on the laptop need the PID; laws on board, later and without a reboot, the app's controller again."""
+    """Laws on the laptop need the PID; controllers on board, later and without a reboot, the app's controller again."""
     policy = Policy.load(shipped_policy("flight"))
     for cores, wanted in ((None, 1), (cores_of(), 6)):
         twin = VirtualTwin(policy, settings_of(policy, 1.0), settle=SETTLE, cores=cores)
