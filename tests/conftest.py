@@ -34,7 +34,7 @@ from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_controller
-from mjxball.train.program import Environments
+from mjxball.train.environments import Environments
 
 # The same as in `command_line.environment`: a cached program is found by the flags that it was compiled with.
 if HASTY not in os.environ.get("XLA_FLAGS", ""):

@@ -27,8 +27,9 @@ from mjxball.plant.teams import Factors, amplitudes_with_loss, padded, ring, rin
 from mjxball.plant.trim import largest_amplitude, safe_radius
 from mjxball.sim.randomization import ResetDistribution
 from mjxball.train import program as programs
+from mjxball.train.environments import Agents, Environments
 from mjxball.train.extensions import Extensions, find
-from mjxball.train.program import Agents, Environments, TrainingProgram
+from mjxball.train.program import TrainingProgram
 
 PAPER = preset("paper")
 SIZES = (2, 3, 4, 6)

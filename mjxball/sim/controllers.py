@@ -218,7 +218,7 @@ class Controllers:
         return wanted if not self._on_pid else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
 
     def follower_command(self, command: Vector, integral: Integral) -> Vector:
-        """A network's `command` in body axes, which includes the PD controller's, with its share of the integrals if any."""
+        """A network's `command` in body axes, which includes the PD controller's, with its share of integrals."""
         if not self._on_pid:
             return command
         xp, controller = command.__array_namespace__(), self._controller

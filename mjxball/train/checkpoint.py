@@ -18,7 +18,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.terminal import warn
 from mjxball.train.curves import best_member, read_members
-from mjxball.train.extensions import Extensions, is_pair, resolve
+from mjxball.train.extensions import Extensions, is_transport_env, resolve
 from mjxball.train.population import Population
 from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
@@ -203,7 +203,7 @@ def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:
     state = _restore(run, population, discard=False)
     if state is None:
         raise InputError(f"{run} has no complete checkpoint")
-    if not is_pair(population.program.env):
+    if not is_transport_env(population.program.env):
         raise InputError(f"{run} was trained on an environment of its own; its policy.npz is all there is to export")
     origin = {**origin, "seed": origin["seed"] + best}
     steps = int(np.ravel(state.steps)[0])

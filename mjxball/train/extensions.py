@@ -102,14 +102,14 @@ def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
         env: Any = TransportEnv(config, physics)
     else:
         env = _instance(kind, config, physics)
-        env = _checked_env(env if is_pair(env) else TracedOnce(env), name_of(extensions.env), config)
+        env = _checked_env(env if is_transport_env(env) else TracedOnce(env), name_of(extensions.env), config)
     if extensions.reward is not None:
         env = Rewarded(env, extensions.reward)
     return env
 
 
-def is_pair(env: Any) -> bool:
-    """Whether `env` is the coupled pair, whose policies are policy files."""
+def is_transport_env(env: Any) -> bool:
+    """Whether `env` is a `TransportEnv`, whose policies are policy files."""
     return isinstance(getattr(env, "unwrapped", env), TransportEnv)
 
 
@@ -206,7 +206,7 @@ def _checked_env(env: Any, name: str, config: Config) -> Any:
     sizes = _read(flag, env, "observation_size"), _read(flag, env, "action_size")
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise InputError(f"{flag}: observation_size and action_size must be whole numbers, not {sizes}; flatten them")
-    each: tuple[int, ...] = first.reward.shape if is_pair(env) else ()  # (F,) with several followers
+    each: tuple[int, ...] = first.reward.shape if is_transport_env(env) else ()  # (F,) with several followers
     timed = env
     if "truncation" not in first.info:
         import_brax_env()

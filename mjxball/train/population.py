@@ -20,8 +20,9 @@ from mjxball.config import Config
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
 from mjxball.train.compilation import Carrying, TracedProgram, compiler_options, jax_setting, partitioned_by_gspmd
+from mjxball.train.environments import Statistics, report
 from mjxball.train.extensions import DEFAULTS, Extensions
-from mjxball.train.program import Statistics, TrainingProgram, TrainState, report, train, warmup
+from mjxball.train.program import Mode, TrainingProgram, TrainState, train, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
@@ -208,6 +209,25 @@ class Population:
         ]
         learnt = started[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *started)
         return state._replace(algorithm=self.place(learnt, self._whole))
+
+    def advance(
+        self, compiled: Compiled, state: TrainState, mode: Mode, pause: Callable[[], bool] = lambda: False
+    ) -> tuple[TrainState, Statistics, Any, int]:
+        """Step all environments `mode.steps` times, rounded up to whole collections, and learn; `pause` ends it.
+
+        Returns (state, statistics, metrics of the last update, steps taken by each environment). On accelerators it
+        returns before the devices are done. The buffers of `state` are donated.
+        """
+        phase, window = self.place_phase(mode.phase), self.program.algorithm.steps_per_collect
+        carried, metrics, taken = FlatState(state, self.no_statistics()), self.no_metrics(), 0
+        while taken < int(mode.steps):
+            keys = compiled.collect(carried, phase)
+            if mode.phase.learning:
+                metrics = compiled.update(carried, keys)
+            taken += window
+            if pause():
+                break
+        return *carried.trees(), self.named(metrics), taken
 
     def evaluation_envs(self, compiled: Compiled) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""

@@ -25,13 +25,13 @@ from mjxball.sim.follower import follower_controller
 from mjxball.train import lock, processes
 from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
+from mjxball.train.environments import Statistics
 from mjxball.train.events import session
-from mjxball.train.extensions import Extensions, is_pair, resolve
+from mjxball.train.extensions import Extensions, is_transport_env, resolve
 from mjxball.train.population import Population
-from mjxball.train.program import Mode, Statistics, TrainState
+from mjxball.train.program import Mode, TrainState
 from mjxball.train.progress import Progress, Row, Start, columns, started
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
-from mjxball.train.stretch import advance
 
 SAVE_EVERY = 60.0  # [s] since the last checkpoint after which the next row is followed by one
 
@@ -205,7 +205,7 @@ class Run:
     def advance(self, mode: Mode, pause: Callable[[], bool] = lambda: False) -> Chunk:
         """Submit the steps of `mode` to the devices; fewer if `pause` returns true."""
         began = self.progress.elapsed()
-        self.state, statistics, metrics, taken = advance(self.population, self._compiled, self.state, mode, pause)
+        self.state, statistics, metrics, taken = self.population.advance(self._compiled, self.state, mode, pause)
         ended = self._clock.submit(lambda: (jax.block_until_ready(statistics), self.progress.elapsed())[1])
         self._reached += taken * self._schedule.num_envs
         return Chunk(taken, self._reached, began, ended, statistics, metrics)
@@ -248,7 +248,7 @@ class Run:
         keys = processes.gather(training.key)
         envs = population.evaluation_envs(self._compiled)
         evaluated = training._replace(envs=envs, key=population.place_keys(keys))
-        after, statistics, *_ = advance(population, self._compiled, evaluated, programs.evaluate(steps))
+        after, statistics, *_ = population.advance(self._compiled, evaluated, programs.evaluate(steps))
         statistics = processes.gather(statistics)
         self.state = after._replace(envs=training.envs, key=population.place_keys(keys))
         reward, ended = population.each(statistics.reward), population.each(statistics.ended)
@@ -302,7 +302,7 @@ class Run:
             if self._starts:
                 origin["start_from"] = self._starts[member % len(self._starts)]
             config = self.population.member_config(member)
-            if not is_pair(self.population.program.env):  # a policy file has the layout of our observation
+            if not is_transport_env(self.population.program.env):  # a policy file has the layout of our observation
                 exported |= network_file(self._network_path(member), learnt, steps, origin)
                 continue
             policy = policy_file(config, follower_controller(config), learnt, steps, origin)

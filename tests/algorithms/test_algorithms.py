@@ -29,8 +29,9 @@ from mjxball.policy.export import policy_file
 from mjxball.policy.file import PolicyFile, load_file, shipped_policy
 from mjxball.sim.follower import follower_controller
 from mjxball.train import program as programs
+from mjxball.train.environments import Environments
 from mjxball.train.extensions import Extensions, find
-from mjxball.train.program import Environments, TrainingProgram
+from mjxball.train.program import TrainingProgram
 from mjxball.train.run_directory import file_hash, start_policy
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])

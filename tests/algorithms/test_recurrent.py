@@ -29,7 +29,7 @@ from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.inference import NetworkController
-from mjxball.train.program import Environments
+from mjxball.train.environments import Environments
 
 UNITS = 7
 

@@ -1,4 +1,4 @@
-"""Flights of both Crazyflie presets on the coupled model, in virtual time: controllers, gains, thrust of the metadata."""
+"""Flights of both Crazyflie presets on the coupled model, in virtual time: controllers, gains, thrust."""
 
 from __future__ import annotations
 

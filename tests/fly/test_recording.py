@@ -91,7 +91,7 @@ def test_the_same_commands_fly_the_same_way(recording: Recording) -> None:
 
 
 def test_a_flight_is_what_the_pure_simulation_says(recording: Recording) -> None:
-    """Position and roll of the flight under both controllers within 20 % of the simulation's, which starts in the air."""
+    """Position and roll of the flight under both controllers within 20 % of the simulation's, from the air."""
     config, met = recording.config, Conditions.of(recording.config)
     rows = [number for number, phase in enumerate(recording.phase) if phase == "fly"]
     begun = recording.time[rows[0]]

@@ -17,7 +17,6 @@ from mjxball.train import program as programs
 from mjxball.train.compilation import TracedProgram, compiler_options
 from mjxball.train.extensions import Extensions, TracedOnce
 from mjxball.train.population import Population
-from mjxball.train.stretch import advance
 
 
 def rolling(state: dict[str, Any], step: Any) -> tuple[dict[str, Any], Any]:
@@ -105,7 +104,7 @@ def test_a_program_that_was_traced_before_trains_alike(tmp_path: Path, monkeypat
         compiled = population.compile(creating=True)
         state = population.start(compiled, 0)
         for mode in (programs.warmup(2), programs.train(4)):
-            state, statistics, *_ = advance(population, compiled, state, mode)
+            state, statistics, *_ = population.advance(compiled, state, mode)
         rewards.append(float(statistics.reward))
         assert int(state.steps) == 12
     assert rewards[0] == rewards[1] != 0.0

@@ -26,7 +26,6 @@ from mjxball.train import train
 from mjxball.train.extensions import Extensions, find, make_env
 from mjxball.train.population import Population
 from mjxball.train.program import TrainingProgram
-from mjxball.train.stretch import advance
 
 SMALL = {
     "total_steps": 6000, "num_envs": 16, "replay_size": 6400, "batch_size": 64, "warmup_steps": 400,
@@ -92,8 +91,8 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
     tiny = with_settings(small, sac={**SMALL, "total_steps": 800})
     population = Population(tiny, "newton-euler", extensions=Extensions(toys.DoubleIntegrator))
     program, compiled = population.program, population.compile(creating=True)
-    state, *_ = advance(population, compiled, population.start(compiled, 5), programs.warmup(program.warmup_rounds))
-    state, *_ = advance(population, compiled, state, programs.train(program.total_rounds - program.warmup_rounds))
+    state, *_ = population.advance(compiled, population.start(compiled, 5), programs.warmup(program.warmup_rounds))
+    state, *_ = population.advance(compiled, state, programs.train(program.total_rounds - program.warmup_rounds))
     policy, _ = jax.jit(lambda key: train(tiny, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(5))
     for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(population.policy(state, 0)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # two programs: XLA may fuse them differently

@@ -12,6 +12,7 @@ from conftest import with_settings
 
 from mjxball import config as configs
 from mjxball.train import program as programs
+from mjxball.train.environments import Statistics
 from mjxball.train.program import TrainingProgram, TrainState
 
 pytestmark = pytest.mark.slow  # trainings
@@ -157,7 +158,7 @@ class Ending(NamedTuple):
     """What the program recorded of one step in which every world ended."""
 
     after: TrainState
-    statistics: programs.Statistics
+    statistics: Statistics
     discount: np.ndarray  # (worlds,)
     next_observation: np.ndarray  # (worlds, n)
     last: np.ndarray  # (worlds,)

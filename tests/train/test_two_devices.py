@@ -27,7 +27,6 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, resolve
 from mjxball.train.population import Population
-from mjxball.train.stretch import advance
 tiny = configs.preset("transport")
 for name, value in {TINY!r}.items():
     tiny = configs.replace(tiny, name, value)
@@ -40,7 +39,7 @@ for algorithm in ALGORITHMS:
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
         for mode in (programs.warmup, programs.train, programs.train, programs.evaluate):
-            state, *_ = advance(population, compiled, state, mode(20))
+            state, *_ = population.advance(compiled, state, mode(20))
         floats = [leaf for leaf in jax.tree.leaves(state.algorithm) if leaf.dtype == np.float32]
         assert all(len(leaf.sharding.device_set) == 2 for leaf in floats)
         assert all(np.isfinite(np.asarray(leaf)).all() for leaf in floats)
