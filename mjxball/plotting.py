@@ -45,7 +45,7 @@ SIMULATED = "the same, simulated"  # label of the simulation beside a real fligh
 _COMMON = {"text.parse_math": False, "svg.fonttype": "none", "pdf.fonttype": 42, "legend.frameon": False}
 _INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
 _LETTERS = ("font.size", "axes.titlesize", "axes.labelsize", "legend.fontsize", "xtick.labelsize", "ytick.labelsize")
-# `figure.figsize` is that of a figure with one column [in]; on screen it is readable on a phone.
+# Sizes are those of a figure with one column [in]; on screen it is readable on a phone.
 STYLES: dict[str, dict[str, Any]] = {
     "screen": {
         **_COMMON,

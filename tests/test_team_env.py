@@ -152,8 +152,8 @@ def drawn() -> tuple[Config, Any, Any, Any]:
     config = settings(
         scenario__drone_mass_scale=(0.8, 1.2), scenario__mount_scale=(0.8, 1.2), scenario__lost_follower_probability=0.5
     )
-    draw = jax.jit(jax.vmap(ResetDistribution(config).draw))
-    load, plant, _, rig = draw(jax.random.split(jax.random.key(0), 400), jnp.arange(400))
+    sample = jax.jit(jax.vmap(ResetDistribution(config).sample))
+    load, plant, _, rig = sample(jax.random.split(jax.random.key(0), 400), jnp.arange(400))
     assert rig is not None
     return config, load, plant, rig
 
