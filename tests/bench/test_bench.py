@@ -239,7 +239,7 @@ def test_an_onnx_file_of_a_policy_comes_to_what_the_policy_does(short: Path):
         np.testing.assert_allclose(ours["command_change"], theirs["command_change"], rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["bad:Good", "bad:Law"])
+@pytest.mark.parametrize("name", ["bad:Good", "bad:Controller"])
 def test_a_follower_from_outside_gets_an_entry(short: Path, name: str):
     assert main(["bench", name, "--tracks", "pair", "--draw", "2", "--out", "entry.json"]) == 0
     entry = json.loads((short / "entry.json").read_text())

@@ -141,11 +141,11 @@ def test_followers_of_ones_own_fly_beside_ours(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "own_eval.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    own = ["copy", "own_eval:Law", "own_eval:Level", "stay"]
+    own = ["copy", "own_eval:Controller", "own_eval:Level", "stay"]
     assert call(main, [*FAST, "--followers", *own, "--seconds", 2, "--json", "cells.json"]) == 0
     rmse = {cell["follower"]: cell["rmse"] for cell in cells_of(tmp_path / "cells.json")}
-    assert list(rmse) == ["copy", "Law", "Level", "stay"]
-    assert rmse["Law"] == rmse["copy"]
+    assert list(rmse) == ["copy", "Controller", "Level", "stay"]
+    assert rmse["Controller"] == rmse["copy"]
     assert rmse["Level"] != rmse["copy"]
     capsys.readouterr()
     for name, said in (("Two", "answered shape (2,) where (1, 3)"), ("Gone", "own_eval has no Gone")):

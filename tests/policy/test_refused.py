@@ -214,7 +214,7 @@ class TestDamagedArrays:
     )
     def test_card_is_not_one_json_object(self, saved, metadata):
         rewrite(saved, lambda arrays: arrays.update({"card": metadata}))
-        refused(saved, "card")
+        refused(saved, "metadata")
 
 
 class TestDamagedCard:

@@ -87,8 +87,8 @@ def test_a_law_of_ones_own_is_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "own_view.py").write_text("from mjxball.control.followers import Copy\nclass Controller(Copy): pass\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    own, ours = (flight_from(name, {"seconds": 1.0}, "newton-euler") for name in ("own_view:Law", "copy"))
-    assert own.title == ours.title.replace("copy", "Law")
+    own, ours = (flight_from(name, {"seconds": 1.0}, "newton-euler") for name in ("own_view:Controller", "copy"))
+    assert own.title == ours.title.replace("copy", "Controller")
     np.testing.assert_array_equal(own["position"], ours["position"])
 
 
