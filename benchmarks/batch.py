@@ -14,7 +14,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
-from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_control_step
+from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_plant_step
 from mjxball.policy import Policy
 from mjxball.policy.inference import NetworkController
 from mjxball.scalar_form import scalar_form
@@ -43,7 +43,7 @@ def fly_compiled(
     engine = (mjx if physics == "mjx" else newton_euler).make_engine(*config_of)
     # Half of the time for hundreds of worlds; MJX and the cascade of a Crazyflie gain nothing, and compile longer.
     rewritten = physics == "newton-euler" and config.autopilot.kind == "ideal"
-    step = (scalar_form if rewritten else jax.vmap)(make_control_step(config, engine, jax_repeat))
+    step = (scalar_form if rewritten else jax.vmap)(make_plant_step(config, engine, jax_repeat))
     loop, privileged = ClosedLoop(config, step, flown.sensors), make_privileged_info(config)
     on_pid = np.float32(not isinstance(follower, Baseline))
     leader, limit = config.plant.leader, config.scenario.termination_distance

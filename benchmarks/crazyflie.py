@@ -92,7 +92,7 @@ def fly_rigs(env: TransportEnv, starts: Any, follower: Follower) -> tuple[np.nda
         state, memory = carried
         world, seen = state.pipeline_state, state.obs[:, :OBSERVATION_SIZE]
         if policy:
-            state = jax.vmap(env.step)(state, controller.answer(world.history, seen)[0])
+            state = jax.vmap(env.step)(state, controller.answer(world.memory, seen)[0])
         else:
             memory, command = controller.step(memory, seen, privileged(world.plant, world.load))
             state = jax.vmap(env.step_with_command)(state, command)

@@ -119,7 +119,7 @@ def arguments_of(plant: Plant, path: str, count: int, seed: int) -> Case:
     if path in ("rod", "plate"):
         force = motion.make_rolling_force(config)(state.ball_offset, state.ball_rate, plant.moving_fraction * mass)
         return "rolling", state, wrench, mass, force
-    return "prescribed", state, wrench, mass, motion.make_prescribed(config)(state.time, load)
+    return "prescribed", state, wrench, mass, motion.make_cg_motion(config)(state.time, load)
 
 
 def difference(found: Any, expected: Any, case: Case) -> float:

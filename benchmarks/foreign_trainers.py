@@ -40,7 +40,7 @@ from mjxball.algorithms.base import PolicyNetwork
 from mjxball.env import TransportEnv
 from mjxball.policy import load_network, save_file
 from mjxball.policy.export import policy_file
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 from mjxball.xla import enable_compilation_cache
 from training import NO_CACHE, evaluate, launch, until_policy
 
@@ -345,7 +345,7 @@ def main() -> None:
     def export(steps: int, found: Any, mean: Any, deviation: Any) -> None:
         mask = jnp.asarray(TransportEnv(config, options.physics).input_mask)
         learnt = PolicyNetwork(found, jnp.asarray(mean), jnp.asarray(deviation), mask)
-        exported = policy_file(config, follower_controller(config), learnt, steps, metadata)
+        exported = policy_file(config, network_interface(config), learnt, steps, metadata)
         if library == "brax":
             save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
         if steps >= options.steps:

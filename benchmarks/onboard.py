@@ -28,7 +28,7 @@ from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile
-from mjxball.policy.file import controller_of, load_file, shipped_policies, shipped_policy
+from mjxball.policy.file import interface_of, load_file, shipped_policies, shipped_policy
 from mjxball.policy.formats.c_header import APP, c_header, footprint
 from mjxfly.app.generate import CORE, options, rig_header, sources
 from mjxfly.policy_setup import config_of
@@ -311,7 +311,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
             seen = (policy.observation_mean[:18] + spread * place).astype(np.float32)
             memory = follower.memory if follower.memory is not None else follower.controller.start(seen)
             records.append(np.concatenate([memory, seen]).astype(np.float32))
-            actions.append(follower.scaled(seen))
+            actions.append(follower.action(seen))
     return np.array(records[:steps]), np.array(actions[:steps])
 
 
@@ -352,7 +352,7 @@ def recurrent(units: int = UNITS) -> PolicyFile:
     policy, random = load_file(shipped_policy("flight")), np.random.default_rng(2)
     metadata = {field: value for field, value in policy.metadata.items() if field not in ("filters", "flown")}
     metadata |= {"format_version": 5, "recurrent_units": units, "previous_action": True}
-    size = controller_of(metadata).input_size
+    size = interface_of(metadata).input_size
 
     def layer(inputs: int, outputs: int) -> np.ndarray:
         return random.normal(scale=inputs**-0.5, size=(inputs, outputs)).astype(np.float32)
@@ -370,7 +370,7 @@ def recurrent(units: int = UNITS) -> PolicyFile:
 
 def placed(policy: PolicyFile, name: str) -> PolicyFile:
     """`policy` as the follower of a pair, if it has to be told."""
-    return in_team(policy, name, PAIR) if controller_of(policy.metadata).geometry else policy
+    return in_team(policy, name, PAIR) if interface_of(policy.metadata).geometry else policy
 
 
 def measure(policy: PolicyFile, name: str, int8: bool, steps: int) -> Row:

@@ -15,10 +15,11 @@ from mjxball.config import Config, Plant
 from mjxball.control.followers import Controller, PrivilegedInfo
 from mjxball.control.geometry import team_geometry
 from mjxball.control.observation import OBSERVATION_SIZE
-from mjxball.env import TransportEnv, make_physics
+from mjxball.env import TransportEnv
 from mjxball.evaluate.metrics import Metrics, RunningMetrics, begin, results, update
 from mjxball.physics.engine import PlantState
 from mjxball.physics.motion import object_mass
+from mjxball.physics.step import make_jax_plant_step
 from mjxball.plant import PlantParameters
 from mjxball.policy.inference import NetworkController
 from mjxball.sim.closed_loop import ClosedLoop
@@ -68,15 +69,15 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, 
     """One flight of `rig` from a random start of `env`, over `times` [s], as a batch of one."""
     config, state = env.config, env.reset(key, None, rig)
     world, observation = state.pipeline_state, state.obs[..., :OBSERVATION_SIZE]
-    disturbances, parameters = RandomDisturbances(config), whole(world.rig, config.plant.gravity)
-    physics = make_physics(config, "newton-euler", parameters)
+    disturbances, parameters = RandomDisturbances(config), whole(world.parameters, config.plant.gravity)
+    physics = make_jax_plant_step(config, "newton-euler", parameters)
     loop = ClosedLoop(config, physics, disturbances.sensors, parameters)
     limit, leader = config.scenario.termination_distance, config.plant.leader
     if isinstance(controller, AnyRigController):
         controller = controller.on(rig, config.plant)
 
     def privileged(plant: PlantState, load: Any) -> PrivilegedInfo:
-        return _privileged(plant, load, world.rig, config.plant.count)
+        return _privileged(plant, load, world.parameters, config.plant.count)
 
     def step(carried: tuple[Carry, Any, RunningMetrics], time: Any) -> Any:
         carry, random, running = carried

@@ -39,7 +39,7 @@ from mjxball.evaluate import metrics
 from mjxball.files import write_atomically
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
-from mjxball.physics.step import ControlStep, make_control_step
+from mjxball.physics.step import PlantStep, make_plant_step
 from mjxball.plant import plant_parameters
 from mjxball.sim.closed_loop import TeamCommands
 from mjxball.sim.rollout import scenario_arrays
@@ -128,10 +128,10 @@ def see(own: np.ndarray, mount: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return np.concatenate([off, matrix.reshape(-1, 9), own[:, 6:9], own[:, 9:12]], axis=1)
 
 
-def _rotor_step(config: Config) -> ControlStep:
+def _rotor_step(config: Config) -> PlantStep:
     """A control step whose commands are rotor forces (n, N, 4) [N]."""
     engine = newton_euler.make_engine(config.plant, config.attitude)
-    step = make_control_step(config, engine, autopilot=lambda state, asked, _: (state.loops, asked))
+    step = make_plant_step(config, engine, autopilot=lambda state, asked, _: (state.loops, asked))
     with jax.enable_x64(True):
         compiled = jax.jit(step)
 

@@ -128,9 +128,9 @@ class Stacked:
         networks = jax.tree.map(lambda part: jnp.asarray(part, observation.dtype), self.networks)
         seen = self._controller.network_input(observation, memory)
         parts = seen.reshape(len(networks.mean), -1, seen.shape[-1])
-        scaled = jax.vmap(Network.__call__)(networks, parts)
-        scaled = scaled.reshape(-1, scaled.shape[-1])
-        return self._controller.next(memory, observation, scaled), self._controller.command(scaled, observation)
+        action = jax.vmap(Network.__call__)(networks, parts)
+        action = action.reshape(-1, action.shape[-1])
+        return self._controller.next(memory, observation, action), self._controller.command(action, observation)
 
 
 class Single(Stacked):

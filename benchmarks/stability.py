@@ -40,7 +40,7 @@ from mjxball.control.followers import Controller, Follower
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import jax_repeat, make_control_step, start_state
+from mjxball.physics.step import jax_repeat, make_plant_step, start_state
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, SensorState
@@ -140,7 +140,7 @@ def closed_loop(
     z holds position, Euler angles, velocity, rates, rotor forces, the follower's memory, older observations.
     """
     period = config.timing.control_period
-    physics = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
+    physics = make_plant_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
     privileged, loop = rollout.make_privileged_info(config), ClosedLoop(config, physics, SensorModel(delay))
     goal, still, zero = jnp.zeros(3), jnp.zeros(3), jnp.zeros(())
 

@@ -19,15 +19,14 @@ from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
 from mjxball.control.geometry import GEOMETRY_SIZE, team_geometry
 from mjxball.errors import InputError
-from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.motion import object_mass
-from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
+from mjxball.physics.step import TRAINING_ENGINES, PlantStep, make_cg_offset, make_jax_plant_step
 from mjxball.plant import PlantParameters, plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop, LoopState, TeamCommands
 from mjxball.sim.disturbances import RandomDisturbances, followers_axis
-from mjxball.sim.follower import follower_controller
-from mjxball.sim.randomization import ResetDistribution, Rig
+from mjxball.sim.follower import network_interface
+from mjxball.sim.randomization import ResetDistribution, SampledRig
 from mjxball.sim.rigs import RigTable, whole
 
 if TYPE_CHECKING:
@@ -61,11 +60,11 @@ class PipelineState(NamedTuple):
     load: Load
     goal: Float[Array, "3"]  # of O [m]
     disturbances: Any  # `sim.disturbances.RandomState`, () without disturbances
-    history: Any  # (m,) the follower's memory, () if m is 0: XLA's partitioner fails on empty arrays
+    memory: Any  # (m,) the follower's memory, () if m is 0: XLA's partitioner fails on empty arrays
     action: Float[Array, "... 3"]  # last network actions in [-1, 1]
     command: Float[Array, "... 3"]  # last followers' commands: roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
-    rig: Any = ()  # `plant.PlantParameters` of this world; () if all worlds have the plant's
+    parameters: Any = ()  # `plant.PlantParameters` of this world; () if all worlds have the plant's
 
     @property
     def plant(self) -> PlantState:
@@ -74,7 +73,7 @@ class PipelineState(NamedTuple):
 
 
 class TransportEnv:
-    """A team that carries one object whose CG moves. The policy flies the followers, a PID controller the leader.
+    """A team that carries one object whose CG moves. The policy flies the followers, a PID interface the leader.
 
     Implements Brax's `Env`. For a pair, observations are (n,), actions (3,) and the reward (). For F > 1 followers they
     are (F, n), (F, 3) and (F,), each in its mount frame. Worlds of smaller teams are padded to the plant's number of
@@ -98,14 +97,14 @@ class TransportEnv:
         self._followers = followers_axis(config)
         self._loop = None if self._resets.rigs else self._make_loop()
         self._ball_limit = ball_limit(config.plant)
-        self._controller = controller = follower_controller(config)
+        self._interface = interface = network_interface(config)
         # Jitted separately: `scalar_form` keeps such calls whole if their arrays are large. `jax.jit` needs a hashable
-        # function, which `partial` makes of a method of the unhashable controller.
-        parts = self._input, self._answer, controller.next if controller.size else lambda *_: ()
+        # function, which `partial` makes of a method of the unhashable interface.
+        parts = self._input, self._answer, interface.next if interface.size else lambda *_: ()
         self._network_input, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
         self._cg = make_cg_offset(config)
-        commanded = layout.commanded(config.follower.load_axis_only, config.plant.cg_axis)
-        self._commanded = np.append(commanded, np.ones(controller.units))
+        mask = layout.action_mask(config.follower.load_axis_only, config.plant.cg_axis)
+        self._action_mask = np.append(mask, np.ones(interface.units))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # index of the tilt (roll, pitch) free of CG torque
         self._in_plane = len(config.plant.directions) == 2
         self._privileged_size = 0
@@ -124,17 +123,17 @@ class TransportEnv:
     @property
     def policy_input_size(self) -> int:
         """Length of the policy's part of the observation; the rest is privileged information of the critics."""
-        return self._controller.input_size + self._controller.units
+        return self._interface.input_size + self._interface.units
 
     @property
     def input_mask(self) -> list[float]:
         """1 for each entry of the observation that the policy uses, else 0."""
-        return [*self._controller.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
+        return [*self._interface.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
 
     @property
     def critic_mask(self) -> list[float]:
         """1 for each entry of the observation that the critics use, else 0."""
-        return [*self._controller.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
+        return [*self._interface.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
 
     @property
     def team_sizes(self) -> tuple[int, ...] | None:
@@ -144,12 +143,12 @@ class TransportEnv:
     @property
     def action_size(self) -> int:
         """Length of an action: roll, pitch, vertical acceleration, then the next state of a recurrent network."""
-        return layout.ACTION_SIZE + self._controller.units
+        return layout.ACTION_SIZE + self._interface.units
 
     @property
     def recurrent_slots(self) -> slice:
         """Entries of the observation that hold the state of a recurrent network; empty without one."""
-        return slice(self.policy_input_size - self._controller.units, self.policy_input_size)
+        return slice(self.policy_input_size - self._interface.units, self.policy_input_size)
 
     @property
     def backend(self) -> str:
@@ -180,8 +179,8 @@ class TransportEnv:
         reward = jnp.zeros(self._followers)
         return State(world, self.seen(world, observation), reward, zero, metrics, {"truncation": zero})
 
-    def step(self, state: State, action: Float[Array, "... actions"], physics: ControlStep | None = None) -> State:
-        """Apply the network's `action` for one control period. `physics`, if given, replaces the engine.
+    def step(self, state: State, action: Float[Array, "... actions"], plant_step: PlantStep | None = None) -> State:
+        """Apply the network's `action` for one control period. `plant_step`, if given, replaces the engine's.
 
         The action is clipped to [-1, 1] before the followers, the history and the reward use it. The state (H,) of a
         recurrent network is part of the observation, and its next state the end of `action` (..., 3 + H). InputError,
@@ -192,26 +191,26 @@ class TransportEnv:
         if jnp.shape(action) != shape:
             raise InputError(f"an action of one world must have shape {shape}, not {jnp.shape(action)}")
         finite = jnp.all(jnp.isfinite(action))
-        action = jnp.where(finite, jnp.clip(action, -1.0, 1.0), jnp.zeros_like(action)) * self._commanded
-        command, memory = self._answered(action, self._observed(state), world.history)
-        return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, physics)
+        action = jnp.where(finite, jnp.clip(action, -1.0, 1.0), jnp.zeros_like(action)) * self._action_mask
+        command, memory = self._answered(action, self._observed(state), world.memory)
+        return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, plant_step)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
         """`step` with the command of a follower that is no network, which is applied unchanged."""
         world = state.pipeline_state
         action = jnp.zeros((*follower_command.shape[:-1], self.action_size))
-        memory = self._remembered(world.history, self._observed(state), action)
+        memory = self._remembered(world.memory, self._observed(state), action)
         return self._step(state, follower_command, memory, action, world.loop.diverged, 0.0)
 
     def commands(self, state: State, action: Float[Array, "... 3"]) -> tuple[Float[Array, "drones 3"], Load]:
         """(commands of all drones, load) that `step` passes to the physics at the network's `action`."""
         given: list[Any] = []
 
-        def physics(plant: PlantState, commands: Float[Array, "drones 3"], load: Load) -> PlantState:
+        def plant_step(plant: PlantState, commands: Float[Array, "drones 3"], load: Load) -> PlantState:
             given.extend((commands, load))
             return plant
 
-        self.step(state, action, physics)
+        self.step(state, action, plant_step)
         return given[0], given[1]
 
     def _observed(self, state: State) -> Float[Array, "... 18"]:
@@ -225,7 +224,7 @@ class TransportEnv:
         action: Float[Array, "... actions"],
         diverged: Bool[Array, ""],
         on_pid: float,
-        physics: ControlStep | None = None,
+        plant_step: PlantStep | None = None,
     ) -> State:
         """The next state after the followers' `command`, with their new `memory`. `on_pid`: see `ClosedLoop.step`."""
         world: PipelineState = state.pipeline_state
@@ -235,12 +234,12 @@ class TransportEnv:
             load = load._replace(external_force=world.disturbances.force)
         disturbances, sample = self._disturbances.step(world.disturbances)
         before, goals = world.loop._replace(diverged=diverged), (world.goal, world.goal)
-        closed_loop = self._loop_of(world.rig)
-        loop, after, commands = closed_loop.step(before, observation, command, load, goals, sample, on_pid, physics)
+        closed_loop = self._loop_of(world.parameters)
+        loop, after, commands = closed_loop.step(before, observation, command, load, goals, sample, on_pid, plant_step)
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
-            history=memory,
+            memory=memory,
             action=action[..., : layout.ACTION_SIZE],
             command=command,
             steps=world.steps + 1,
@@ -269,13 +268,15 @@ class TransportEnv:
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )
 
-    def _make_loop(self, rig: PlantParameters | None = None) -> ClosedLoop:
-        physics = _lazy_control_step(functools.partial(make_physics, self.config, self._backend, rig))
-        return ClosedLoop(self.config, physics, self._disturbances.sensors, rig)
+    def _make_loop(self, parameters: PlantParameters | None = None) -> ClosedLoop:
+        make = functools.partial(make_jax_plant_step, self.config, self._backend, parameters)
+        return ClosedLoop(self.config, _lazy_plant_step(make), self._disturbances.sensors, parameters)
 
-    def _loop_of(self, rig: Any) -> ClosedLoop:
-        """The closed loop of a world with this `rig` (`PipelineState.rig`)."""
-        return self._loop or self._make_loop(whole(rig, self.config.plant.gravity) if self.config.rigs.number else rig)
+    def _loop_of(self, parameters: Any) -> ClosedLoop:
+        """The closed loop of a world with these `PipelineState.parameters`."""
+        if self.config.rigs.number:
+            parameters = whole(parameters, self.config.plant.gravity)
+        return self._loop or self._make_loop(parameters)
 
     def _fresh_world(
         self,
@@ -296,17 +297,17 @@ class TransportEnv:
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._controller.start(observation, self._geometry(rig)) if self._controller.size else (),
+            memory=self._interface.start(observation, self._geometry(rig)) if self._interface.size else (),
             action=jnp.zeros((*self._followers, 3)),
             command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
-            rig=parameters,
+            parameters=parameters,
         )
         return world, observation
 
-    def _geometry(self, rig: Rig | None) -> Any:
+    def _geometry(self, rig: SampledRig | None) -> Any:
         """Mount geometry of a world as given to its followers; None unless they take it."""
-        if not self._controller.geometry:
+        if not self._interface.geometry:
             return None
         plant = self.config.plant
         if rig is not None and rig.row is not None:
@@ -317,26 +318,25 @@ class TransportEnv:
 
     def seen(self, world: PipelineState, observation: Float[Array, "... 18"]) -> Float[Array, "... input"]:
         """The networks' input: the policy's input, then the critics' privileged information."""
-        network_input = self._network_input(observation, world.history) if self._controller.size else observation
+        network_input = self._network_input(observation, world.memory) if self._interface.size else observation
         if self.config.follower.privileged_critic:
             network_input = jnp.concatenate([network_input, self._privileged(world)], axis=-1)
         return network_input
 
     def _input(self, observation: Float[Array, "... 18"], memory: Float[Array, "... m"]) -> Array:
         """Input of the policy network."""
-        if self._controller.geometry:  # the geometry is constant, so no derivatives need be carried through it
+        if self._interface.geometry:  # the geometry is constant, so no derivatives need be carried through it
             history, geometry = memory[..., :-GEOMETRY_SIZE], memory[..., -GEOMETRY_SIZE:]
             memory = jnp.concatenate([history, jax.lax.stop_gradient(geometry)], axis=-1)
-        return self._controller.network_input(observation, memory)
+        return self._interface.network_input(observation, memory)
 
     def _answer(
         self, action: Float[Array, "... actions"], observation: Float[Array, "... 18"], memory: Any
     ) -> tuple[Float[Array, "... 3"], Any]:
         """(command, memory at the next step) for the network's `action`."""
-        controller = self._controller
-        return controller.command(action, observation), controller.next(
-            memory, observation, action
-        ) if controller.size else ()
+        interface = self._interface
+        after = interface.next(memory, observation, action) if interface.size else ()
+        return interface.command(action, observation), after
 
     def _first_privileged(self, rng: Array) -> Float[Array, "... privileged"]:
         return self._privileged(self._fresh_world(rng)[0])
@@ -347,7 +347,7 @@ class TransportEnv:
         Depending on the configuration then the undisturbed observation, force and levels of disturbances, actuator
         errors, controllers' integrals, rate of the ball, battery, and the size of the team.
         """
-        loop, load = self._loop_of(world.rig), world.load
+        loop, load = self._loop_of(world.parameters), world.load
         offset, mass = self._cg(world.plant, load), object_mass(world.plant.time, load)
         if self._in_plane:
             offset = loop.seen_by_followers(offset)
@@ -376,7 +376,7 @@ class TransportEnv:
             uncompensated: Array = load.uncompensated
             parts += [jnp.stack([battery, uncompensated])]
         if self.config.scenario.team_sizes:
-            parts += [(world.rig.drone_mass > 0).sum()[None] / self.config.plant.count]
+            parts += [(world.parameters.drone_mass > 0).sum()[None] / self.config.plant.count]
         return jnp.concatenate([jnp.broadcast_to(part, (*self._followers, part.shape[-1])) for part in parts], axis=-1)
 
     def _leaders_and_own(self, each: Float[Array, " drones"]) -> Float[Array, "... 2"]:
@@ -388,11 +388,11 @@ class TransportEnv:
 
     def _transition(
         self, before: PipelineState, after: PipelineState, commands: TeamCommands, terminated: Bool[Array, ""]
-    ) -> rewards.Transition:
+    ) -> rewards.RewardInputs:
         """Inputs of the reward of the step from `before` to `after`."""
         plant = after.plant
         remembers = bool(self.config.follower.observation_averages)
-        return rewards.Transition(
+        return rewards.RewardInputs(
             error=after.goal - plant.position,
             velocity=plant.velocity,
             euler=rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion)),
@@ -400,11 +400,11 @@ class TransportEnv:
             action=after.action,
             last_action=before.action,
             command_change=after.command - before.command,
-            action_average=self._controller.history.slowest_action(before.history) if remembers else None,
+            action_average=self._interface.history.slowest_action(before.memory) if remembers else None,
             leader_command=commands.leader,
             follower_command=commands.follower,
             tilt_disagreement=(commands.follower - commands.leader)[..., self._unloaded],
-            spread=self._spread(commands.follower, after.rig) if self._followers else None,
+            spread=self._spread(commands.follower, after.parameters) if self._followers else None,
             ball=jnp.atleast_1d(plant.ball_offset / self._ball_limit),
             terminated=terminated,
         )
@@ -433,29 +433,18 @@ class TransportEnv:
         return columns
 
 
-def _lazy_control_step(make: Callable[[], ControlStep]) -> ControlStep:
-    """The control step that `make` returns, built at its first call: programs that only reset worlds need no engine.
+def _lazy_plant_step(make: Callable[[], PlantStep]) -> PlantStep:
+    """The step that `make` returns, built at its first call: programs that only reset worlds need no engine.
 
     If JAX traces that call, the engine is built outside the trace.
     """
 
     @functools.cache
-    def made() -> ControlStep:
+    def made() -> PlantStep:
         with jax.ensure_compile_time_eval():
             return make()
 
-    def control_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
+    def plant_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         return made()(state, commands, load)
 
-    return control_step
-
-
-def make_physics(config: Config, physics: str, rig: PlantParameters | None = None) -> ControlStep:
-    """The control step of the engine `physics`, mjx or newton-euler, for one world; use `jax.vmap` for many.
-
-    `rig`: parameters of the world's plant, if they are not those of `config.plant`.
-    """
-    make = newton_euler.make_engine
-    if physics == "mjx":
-        from mjxball.physics.mjx import make_engine as make  # takes a second to import
-    return make_control_step(config, make(config.plant, config.attitude, rig), jax_repeat, rig)
+    return plant_step

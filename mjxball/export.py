@@ -22,13 +22,13 @@ from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
 def policy_of_run(run: Path) -> PolicyFile:
     """The policy of the newest checkpoint in the run directory `run`. Raises InputError unless it is finite."""
     from mjxball.policy.export import is_sound, policy_file
-    from mjxball.sim.follower import follower_controller
+    from mjxball.sim.follower import network_interface
     from mjxball.train.checkpoint import restore_policy
     from mjxball.train.curves import training_summary
 
     config, learnt, steps, origin = restore_policy(run)
     policy = policy_file(
-        config, follower_controller(config), learnt, steps, {**origin, **training_summary(run, origin["seed"])}
+        config, network_interface(config), learnt, steps, {**origin, **training_summary(run, origin["seed"])}
     )
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Scalar, Vector
 
 
-class Transition(NamedTuple):
+class RewardInputs(NamedTuple):
     """Inputs of a reward: the true state after one control step, and the commands during it.
 
     With several followers `action`, `last_action`, `action_average`, `follower_command`, `tilt_disagreement` and
@@ -42,7 +42,7 @@ def paper_reward(leader_command: Vector, follower_command: Vector) -> Scalar:
     return -10.0 * xp.abs(leader_command - follower_command).sum(axis=-1)
 
 
-def task_reward(weights: Reward, step: Transition) -> Scalar:
+def task_reward(weights: Reward, step: RewardInputs) -> Scalar:
     """Task reward (ours): minus a weighted sum of costs, without the cost of a termination.
 
     The cost of the error is a pseudo-Huber loss: |e| / scale far away, (e / scale)^2 / 2 near the goal.
@@ -83,7 +83,7 @@ def _used(weight: Scalar | float) -> bool:
     return not isinstance(weight, (int, float)) or weight != 0
 
 
-def reward(weights: Reward, step: Transition) -> Scalar:
+def reward(weights: Reward, step: RewardInputs) -> Scalar:
     """The reward of `weights.kind`, minus the cost of a termination."""
     xp = step.error.__array_namespace__()
     paper = weights.kind == "paper"

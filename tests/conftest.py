@@ -33,7 +33,7 @@ from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 from mjxball.train.environments import Environments
 
 # The same as in `command_line.environment`: a cached program is found by the flags that it was compiled with.
@@ -234,7 +234,7 @@ def make_trained(config: Config) -> Trained:
     seen = jnp.asarray(centre + spread * random.normal(size=(500, env.observation_size)), jnp.float32)
     learner = learner._replace(normaliser=sac.brax.running_statistics.update(learner.normaliser, seen))
     return Trained(
-        config, networks, learner, policy_file(config, follower_controller(config), policy_of(env, learner), steps=1234)
+        config, networks, learner, policy_file(config, network_interface(config), policy_of(env, learner), steps=1234)
     )
 
 
@@ -276,7 +276,7 @@ def recurrent(transport: Config) -> Recurrent:
         state._replace(layers=layers, mean=np.float32(centre), square=square, seen=np.float32(1))
     )
     assert network.units
-    return Recurrent(config, network, policy_file(config, follower_controller(config), network, steps=1234))
+    return Recurrent(config, network, policy_file(config, network_interface(config), network, steps=1234))
 
 
 @pytest.fixture(scope="session")

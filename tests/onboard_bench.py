@@ -16,7 +16,7 @@ import pytest
 import onboard
 from mjxball.export import in_team
 from mjxball.policy import PolicyFile, load_file
-from mjxball.policy.file import controller_of, shipped_policy
+from mjxball.policy.file import interface_of, shipped_policy
 from mjxfly.app import host, protocol
 from mjxfly.app.host import App, Library, OnboardState, compile_pair
 from mjxfly.app.protocol import CAUSES, AppPhase
@@ -43,7 +43,7 @@ def policy_of(name: str) -> PolicyFile:
 
 def in_pair(policy: PolicyFile) -> PolicyFile:
     """Told that it flies a pair of Crazyflies, if it has to be told."""
-    return in_team(policy, "follower", Path("crazyflie")) if controller_of(policy.metadata).geometry else policy
+    return in_team(policy, "follower", Path("crazyflie")) if interface_of(policy.metadata).geometry else policy
 
 
 @functools.cache

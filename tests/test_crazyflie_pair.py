@@ -17,7 +17,7 @@ from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import hover_rotor_force, make_control_step, make_stepper, start_state
+from mjxball.physics.step import hover_rotor_force, make_numpy_plant_step, make_plant_step, start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxball.sim.rollout import simulate
@@ -70,7 +70,7 @@ def still_load(worlds: int = 1) -> Load:
 
 def flown(config: Config, command: Sequence[Any], seconds: float) -> PlantState:
     """The state after both drones were sent `command` from a hover at rest."""
-    step, load = make_stepper(config, "newton-euler"), still_load()
+    step, load = make_numpy_plant_step(config, "newton-euler"), still_load()
     zero = np.zeros((1, 3))
     state = start_state(config, zero, zero, zero, load.believed_mass, np.zeros(1))
     for _ in range(round(seconds / config.timing.control_period)):
@@ -135,7 +135,7 @@ class TestPair:
         with jax.enable_x64(True):
             reached = []
             for move in (lambda value: value, lambda value: jax.tree.map(jax.numpy.asarray, value)):
-                step = make_control_step(PAIR, newton_euler.make_engine(PAIR.plant, PAIR.attitude))
+                step = make_plant_step(PAIR, newton_euler.make_engine(PAIR.plant, PAIR.attitude))
                 now, acting, sent = move(state), move(load), move(commands)
                 for _ in range(2):
                     now = step(now, sent, acting)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mjxball.config import Reward
-from mjxball.rewards import Transition, paper_reward, reward, task_reward
+from mjxball.rewards import RewardInputs, paper_reward, reward, task_reward
 
 ZERO = np.zeros(3)
 ERROR_ONLY = Reward(error=2.0, error_scale=0.1, velocity=0, tilt=0, rates=0, effort=0, smoothness=0)
 
 
-STILL = Transition(*[ZERO] * 10, tilt_disagreement=0.0, spread=ZERO, ball=ZERO[:1], terminated=np.array(False))
+STILL = RewardInputs(*[ZERO] * 10, tilt_disagreement=0.0, spread=ZERO, ball=ZERO[:1], terminated=np.array(False))
 
 
 def task(weights=ERROR_ONLY, **parts):

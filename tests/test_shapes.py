@@ -83,13 +83,13 @@ TRAINING = """
 import jax
 from conftest import with_settings
 from mjxball import config
-from mjxball.train.program import TrainingProgram, train
+from mjxball.train.program import TrainingProgram, train_mode
 for preset, physics in (("balance", "mjx"), ("flight", "newton-euler"), ("paper", "newton-euler")):
     small = {"num_envs": 8, "batch_size": 8, "replay_size": 8000}
     settings = with_settings(config.preset(preset), sac=small, follower={"recurrent_units": 0})
     program = TrainingProgram(settings, physics)
     state = jax.eval_shape(program.create, jax.random.key(0))
-    jax.eval_shape(program.advance, state, train(1))
+    jax.eval_shape(program.advance, state, train_mode(1))
 """
 FLIGHTS = """
 import dataclasses

@@ -215,9 +215,9 @@ class TestWorlds:
 
 
 def paths(config: Config, time: Any, load: Any) -> Any:
-    from mjxball.physics.motion import make_prescribed
+    from mjxball.physics.motion import make_cg_motion
 
-    return make_prescribed(config)(time, load).offset
+    return make_cg_motion(config)(time, load).offset
 
 
 class TestAgents:
@@ -324,8 +324,8 @@ def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
     state = jax.jit(program.create)(jax.random.PRNGKey(0))
     before = program.policy(state).layers
     advance = jax.jit(program.advance)
-    state, _, _ = advance(state, programs.warmup(10))
-    state, statistics, metrics = advance(state, programs.train(10))
+    state, _, _ = advance(state, programs.warmup_mode(10))
+    state, statistics, metrics = advance(state, programs.train_mode(10))
     after = program.policy(state).layers
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, metrics, statistics)))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), before, after)

@@ -41,7 +41,7 @@ from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
 MODULES = (  # known by their last name
     *("cells", "horizon", "rigs", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
     *(
-        "mjxball.control.follower_controller",
+        "mjxball.control.network_interface",
         "mjxball.control.motors",
         "mjxball.evaluate.metrics",
         "mjxball.physics.engine",

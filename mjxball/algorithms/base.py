@@ -121,7 +121,7 @@ class Transition(NamedTuple):
 
 
 class Environments(Protocol):
-    """Batch of environments as an algorithm sees it, implemented in `mjxball.train.program`."""
+    """Batch of environments as an algorithm sees it, implemented in `mjxball.train.environments`."""
 
     count: int  # of this shard
     observation_size: int

@@ -85,15 +85,15 @@ def copy_command(
     return leader.pid_command(error, rate, zero, (kp, kd, 0.0), gravity, tilt_limit, vertical_limit)
 
 
-def commanded(load_axis_only: bool, cg_axis: str) -> tuple[float, float, float]:
+def action_mask(load_axis_only: bool, cg_axis: str) -> tuple[float, float, float]:
     """1 for each action that a network commands, else 0: of roll and pitch perhaps only the one that the load turns."""
     return (1.0, 1.0, 1.0) if not load_axis_only else (float(cg_axis == "y"), float(cg_axis == "x"), 1.0)
 
 
-def scale_action(scaled: Array, tilt_limit: float, vertical_limit: float) -> Array:
+def scale_action(action: Array, tilt_limit: float, vertical_limit: float) -> Array:
     """Network action in [-1, 1] (..., 3) -> (roll, pitch [rad], vertical acceleration [m/s2])."""
-    xp = scaled.__array_namespace__()
-    return scaled * xp.asarray([tilt_limit, tilt_limit, vertical_limit], dtype=scaled.dtype)
+    xp = action.__array_namespace__()
+    return action * xp.asarray([tilt_limit, tilt_limit, vertical_limit], dtype=action.dtype)
 
 
 class ObservationHistory(NamedTuple):

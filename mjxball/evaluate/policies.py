@@ -11,7 +11,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
-from mjxball.policy.file import controller_of
+from mjxball.policy.file import interface_of
 from mjxball.sim.outside import outside
 from mjxball.terminal import warn
 
@@ -82,7 +82,7 @@ def _from_metadata(name: Path | str, record: dict[str, Any]) -> Config:
 
 def flies_any_rig(policy: Policy) -> bool:
     """Whether `policy` flies any rig, of which it knows where the drones are mounted alone."""
-    return controller_of(policy.metadata).geometry and trained_rigs(policy).rigs.number > 0
+    return interface_of(policy.metadata).geometry and trained_rigs(policy).rigs.number > 0
 
 
 def trained_rigs(policy: Policy) -> Config:

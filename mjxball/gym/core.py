@@ -22,7 +22,7 @@ from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import PipelineState, TransportEnv
 from mjxball.errors import InputError
 from mjxball.physics.engine import PlantState
-from mjxball.physics.step import make_cg_offset, make_stepper, on_the_host
+from mjxball.physics.step import make_cg_offset, make_numpy_plant_step, on_the_host
 from mjxball.plant.teams import ring
 from mjxball.xla import enable_compilation_cache
 
@@ -176,7 +176,7 @@ class World:
         if self._scene is None:
             from mjxball.scene import Scene
 
-            size = int(present(world.rig, plant.followers).sum()) + 1
+            size = int(present(world.parameters, plant.followers).sum()) + 1
             team = ring(plant, size) if self._config.scenario.team_sizes else plant
             self._scene = Scene(team, goal, PICTURE, self._look_at)
         self._scene.move_goal(goal, self._look_at)
@@ -198,7 +198,7 @@ class HostWorld(World):
 
     def _compile(self) -> None:
         super()._compile()
-        self._move = make_stepper(self._config, self._engine)
+        self._move = make_numpy_plant_step(self._config, self._engine)
 
     def reset(self, seed: int | Sequence[int] | None) -> None:
         """See `World.reset`."""

@@ -95,7 +95,7 @@ class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
         return FollowersState(done=world.done > 0, step=world.pipeline_state.steps, world=world)
 
     def _there(self, world: State) -> Array:
-        return core.present(world.pipeline_state.rig, self.config.plant.followers)
+        return core.present(world.pipeline_state.parameters, self.config.plant.followers)
 
     def _each(self, values: Array) -> Each:
         return dict(zip(self.agents, values, strict=True))

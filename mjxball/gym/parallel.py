@@ -62,7 +62,7 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
         """A world sampled from `config.scenario`; seeds as in `FollowerEnv`, `options` are not used."""
         reseed = seed is not None or self._world.state is None
         self._world.reset(core.seed_number(np_random(seed)[0]) if reseed else None)
-        rig = jax.tree.map(np.asarray, self._world.state.pipeline_state.rig)
+        rig = jax.tree.map(np.asarray, self._world.state.pipeline_state.parameters)
         self.agents = self.possible_agents[: core.present(rig, self.config.plant.followers).sum()]
         return self._observations(), {agent: {} for agent in self.agents}
 

@@ -59,7 +59,7 @@ def coordinates(value: Coordinates, directions: int) -> list[Scalar]:
     return [value] if directions == 1 else [value[..., number] for number in range(directions)]
 
 
-def joined(values: Sequence[Scalar]) -> Coordinates:
+def from_coordinates(values: Sequence[Scalar]) -> Coordinates:
     """The inverse of `coordinates`: one coordinate as it is, two along the last axis."""
     return values[0] if len(values) == 1 else arrays.joined(values)
 

@@ -11,7 +11,7 @@ import numpy as np
 from mjxball.arrays import Array
 from mjxball.config import Config, cg_limit
 from mjxball.errors import InputError
-from mjxball.physics.engine import CgState, Load, PathShape, joined
+from mjxball.physics.engine import CgState, Load, PathShape, from_coordinates
 from mjxball.plant import PlantParameters, plant_parameters
 
 if TYPE_CHECKING:
@@ -73,11 +73,11 @@ def lissajous(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, sha
     """(A sin a, width A sin(ratio a + lead)) (..., 2), a = Omega t + phase, turned by the direction of `shape`."""
     first = sine(time, amplitude, speed, phase)
     if shape is None:
-        return CgState(*(joined([value, value.__array_namespace__().zeros_like(value)]) for value in first))
+        return CgState(*(from_coordinates([value, value.__array_namespace__().zeros_like(value)]) for value in first))
     second = sine(time, amplitude * shape.width, speed * shape.ratio, phase * shape.ratio + shape.lead)
     xp = shape.direction.__array_namespace__()
     c, s = xp.cos(shape.direction), xp.sin(shape.direction)
-    return CgState(*(joined([c * u - s * v, s * u + c * v]) for u, v in zip(first, second, strict=True)))
+    return CgState(*(from_coordinates([c * u - s * v, s * u + c * v]) for u, v in zip(first, second, strict=True)))
 
 
 def lissajous_or_waypoints(time: Scalar, load: Load) -> CgState:
@@ -88,7 +88,7 @@ def lissajous_or_waypoints(time: Scalar, load: Load) -> CgState:
         return swinging
     xp, follows = time.__array_namespace__(), load.follows_path[..., None] > 0
     ways = zip(*(waypoints(time, *sines, load.cg_path[..., axis]) for axis in (0, 1)), strict=True)
-    return CgState(*(xp.where(follows, joined(b), a) for a, b in zip(swinging, ways, strict=True)))
+    return CgState(*(xp.where(follows, from_coordinates(b), a) for a, b in zip(swinging, ways, strict=True)))
 
 
 class Spline(NamedTuple):
@@ -130,7 +130,7 @@ def follow_spline(spline: Spline, time: Scalar) -> CgState:
     return CgState(((a * s + b) * s + c) * s + d, xp.where(inside, rate, zero), xp.where(inside, acceleration, zero))
 
 
-def make_prescribed(config: Config) -> Prescribed:
+def make_cg_motion(config: Config) -> Prescribed:
     """Return `prescribed(time, load)`, the motion of the CG of the kinds sine and waveform.
 
     Raises InputError if the spline of a waveform leaves the object between its samples.
@@ -151,7 +151,7 @@ def make_prescribed(config: Config) -> Prescribed:
 
     def follow(time: Scalar, load: Load) -> CgState:
         both = zip(follow_spline(spline, time), follow_spline(across, time), strict=True)
-        return CgState(*(joined(pair) for pair in both))
+        return CgState(*(from_coordinates(pair) for pair in both))
 
     return follow
 

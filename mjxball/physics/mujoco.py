@@ -193,7 +193,7 @@ def flown_contact_wrenches(
         ball = CgState(flown.ball_offset, flown.ball_rate, flown.ball_rate)
         drive = motion.make_rolling_force(config)(flown.ball_offset, flown.ball_rate, share * mass)
     else:
-        ball = motion.make_prescribed(config)(flown.time, load)
+        ball = motion.make_cg_motion(config)(flown.time, load)
         ball = CgState(ball.offset / share, ball.rate / share, ball.acceleration / share)
         drive = ball.acceleration
 

@@ -8,7 +8,7 @@ from mjxball import arrays
 from mjxball.arrays import Array
 from mjxball.config import Attitude, Plant
 from mjxball.control.rotations import cross, dot, matrix_from_quaternion, rotate, solve_symmetric
-from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, coordinates, joined, solve_small
+from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, coordinates, from_coordinates, solve_small
 from mjxball.plant import ROLLING_INERTIA, PlantParameters, plant_parameters
 from mjxball.plant.parameters import diagonal, point_inertia, rigid_inertia, rigid_mass, rigid_moment
 
@@ -68,7 +68,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
         ball = solve_small(rows, driving)
         for one, (a, turning) in zip(ball, recoils, strict=True):
             linear, angular = linear + one[..., None] * a, angular + one[..., None] * turning
-        return rotate(matrix, linear), angular, joined(ball)
+        return rotate(matrix, linear), angular, from_coordinates(ball)
 
     return Engine(prescribed, rolling)
 

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 TRAINING_ENGINES = ("mjx", "newton-euler")  # on JAX
 ENGINES = (*TRAINING_ENGINES, "mujoco")
-# control_step(state, commands (..., N, 3) of all drones, body axes, load) -> state one control period later
-ControlStep = Callable[[PlantState, Array, Load], PlantState]
+# plant_step(state, commands (..., N, 3) of all drones, body axes, load) -> state one control period later: the commands
+# are held, sensors and controllers are those of `sim.closed_loop`
+PlantStep = Callable[[PlantState, Array, Load], PlantState]
 # repeat(body, count, value): apply `body` to `value` `count` times
 Repeat = Callable[[Callable[[PlantState], PlantState], int, PlantState], PlantState]
 
@@ -47,13 +48,13 @@ def jax_repeat(body: Callable[[PlantState], PlantState], count: int, value: Plan
     return jax.lax.scan(lambda carry, _: (body(carry), None), value, None, length=count)[0]
 
 
-def make_control_step(
+def make_plant_step(
     config: Config,
     engine: Engine,
     repeat: Repeat = python_repeat,
     parameters: PlantParameters | None = None,
     autopilot: Autopilot | None = None,
-) -> ControlStep:
+) -> PlantStep:
     """Return the function that advances the plant by one control period with commands held.
 
     `parameters` replace those of `config.plant`; the engine must have the same. `autopilot` replaces the one that
@@ -92,10 +93,10 @@ def make_control_step(
         )
         return _drift(kicked, h / 2)
 
-    def control_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
+    def plant_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         return repeat(lambda s: physics_step(s, commands, load), config.timing.physics_steps, state)
 
-    return control_step
+    return plant_step
 
 
 def lag_weights(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
@@ -127,11 +128,11 @@ def make_accelerations(
             return engine.rolling(state, wrench, mass, on_ball, load.added_inertia)
 
         return roll
-    prescribed = motion.make_prescribed(config)
+    cg_motion = motion.make_cg_motion(config)
 
     def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Coordinates]:
         mass = motion.object_mass(state.time, load)
-        cg = prescribed(state.time, load)
+        cg = cg_motion(state.time, load)
         linear, angular = engine.prescribed(state, wrench, mass, cg, load.added_inertia)
         return linear, angular, state.ball_rate.__array_namespace__().zeros_like(state.ball_rate)
 
@@ -142,8 +143,8 @@ def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Coordinates]:
     """Return `cg_offset(state, load)`, the present offset of the CG from O along the load's directions [m]."""
     if config.motion.kind == "rolling":
         return lambda state, load: config.plant.moving_fraction * state.ball_offset
-    prescribed = motion.make_prescribed(config)
-    return lambda state, load: prescribed(state.time, load).offset
+    cg_motion = motion.make_cg_motion(config)
+    return lambda state, load: cg_motion(state.time, load).offset
 
 
 def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
@@ -213,29 +214,38 @@ def _drift(state: PlantState, h: float) -> PlantState:
     )
 
 
-def make_stepper(config: Config, physics: str) -> ControlStep:
-    """Return a control step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine."""
+def make_numpy_plant_step(config: Config, physics: str) -> PlantStep:
+    """Return an engine's step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine."""
     if physics == "mujoco":
         from mjxball.physics.mujoco import make_engine
 
-        return make_control_step(config, make_engine(config.plant, config.attitude))
+        return make_plant_step(config, make_engine(config.plant, config.attitude))
     if physics not in ENGINES:
         raise InputError(f"unknown physics {physics!r}; choose from {', '.join(ENGINES)}")
-    return _jax_stepper(config, physics)
+    return _compiled_step(config, physics)
+
+
+def make_jax_plant_step(config: Config, physics: str, parameters: PlantParameters | None = None) -> PlantStep:
+    """Return the step of the engine `physics`, mjx or newton-euler, for one world on JAX; use `jax.vmap` for many.
+
+    `parameters`: those of the world's plant, if they are not those of `config.plant`.
+    """
+    from mjxball.physics.newton_euler import make_engine as make
+
+    if physics == "mjx":
+        from mjxball.physics.mjx import make_engine as make  # takes a second to import
+    return make_plant_step(config, make(config.plant, config.attitude, parameters), jax_repeat, parameters)
 
 
 @functools.lru_cache(maxsize=8)  # compiling takes seconds
-def _jax_stepper(config: Config, physics: str) -> ControlStep:
+def _compiled_step(config: Config, physics: str) -> PlantStep:
     import jax
 
-    from mjxball.physics import mjx, newton_euler
     from mjxball.xla import enable_compilation_cache
 
     enable_compilation_cache()
-    make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
     with jax.enable_x64(True), on_the_host():
-        step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
-        compiled = jax.jit(jax.vmap(step))
+        compiled = jax.jit(jax.vmap(make_jax_plant_step(config, physics)))
 
     def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
         with jax.enable_x64(True), on_the_host():

@@ -12,40 +12,40 @@ import numpy as np
 
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
-from mjxball.control.follower_controller import FollowerController
 from mjxball.control.geometry import GEOMETRY
 from mjxball.control.motors import firmware
-from mjxball.control.observation import ACTION, OBSERVATION, commanded
+from mjxball.control.network_interface import NetworkInterface
+from mjxball.control.observation import ACTION, OBSERVATION, action_mask
 from mjxball.files import write_atomically
 from mjxball.policy.file import PolicyFile
 
 
 def policy_file(
-    config: Config, controller: FollowerController, learnt: Any, steps: int, origin: dict[str, Any] | None = None
+    config: Config, interface: NetworkInterface, learnt: Any, steps: int, origin: dict[str, Any] | None = None
 ) -> PolicyFile:
     """The policy file of a trained network, `learnt` (`algorithms.base.PolicyNetwork`), after `steps` steps.
 
-    `controller`: `sim.follower.follower_controller(config)`. `origin` (command, seed, commit, ...) is added to the
+    `interface`: `sim.follower.network_interface(config)`. `origin` (command, seed, commit, ...) is added to the
     metadata.
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
     size = (
-        controller.input_size
+        interface.input_size
     )  # further inputs are a GRU's state, and those of critics alone, whose weights are not exported
-    mask = np.array(controller.mask(follower.ignore_position))[:size]
+    mask = np.array(interface.mask(follower.ignore_position))[:size]
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
     metadata = {
-        "format_version": 5 if controller.units else 1,
+        "format_version": 5 if interface.units else 1,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": 1,  # number of observations; 0.1.0 and earlier allowed more
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
-        **({"recurrent_units": controller.units} if controller.units else {}),
+        **({"recurrent_units": interface.units} if interface.units else {}),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
-        **({"context": list(GEOMETRY)} if controller.geometry else {}),
+        **({"context": list(GEOMETRY)} if interface.geometry else {}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),
@@ -62,11 +62,13 @@ def policy_file(
         "bounds": {name: bound for name, bound in to_dict(config.bounds).items() if bound > 0},
         **(origin or {}),
     }
-    # Outputs: means, then deviations of the action. The means of components that are not commanded become 0.
-    keep = np.append(commanded(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(np.float32)
+    # Outputs: means, then deviations of the action. The means of components that are masked become 0.
+    keep = np.append(action_mask(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(
+        np.float32
+    )
     weights[-1], biases[-1] = weights[-1] * keep, biases[-1] * keep
     return PolicyFile(
-        weights=(weights[0][: size + controller.units], *weights[1:]),
+        weights=(weights[0][: size + interface.units], *weights[1:]),
         biases=tuple(biases),
         observation_mean=np.asarray(learnt.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control.follower_controller import FollowerController
 from mjxball.control.geometry import GEOMETRY
 from mjxball.control.network import Network
+from mjxball.control.network_interface import NetworkInterface
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, ObservationHistory
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
@@ -63,10 +63,10 @@ class PolicyFile:
     gru: tuple[np.ndarray, ...] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
 
 
-def controller_of(metadata: dict[str, Any]) -> FollowerController:
-    """The controller around the network of a policy file with `metadata`; the first files have no `filters`."""
+def interface_of(metadata: dict[str, Any]) -> NetworkInterface:
+    """The interface around the network of a policy file with `metadata`; the first files have no `filters`."""
     filters = tuple(metadata.get("filters", ()))
-    return FollowerController(
+    return NetworkInterface(
         history=ObservationHistory(metadata["previous_action"], filters, float(metadata["control_period"])),
         action_scale=tuple(metadata["action_reach"]),
         limits=tuple(metadata["command_limits"]),
@@ -174,8 +174,8 @@ def _read_metadata(name: str, text: np.ndarray) -> dict[str, Any]:
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is valid."""
     _check_metadata(policy.metadata, name)
-    controller = controller_of(policy.metadata)
-    size = controller.input_size
+    interface = interface_of(policy.metadata)
+    size = interface.input_size
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -187,11 +187,11 @@ def check(policy: PolicyFile, name: str) -> None:
         raise PolicyFileError(f"{name}: observation_scale must not be negative and action_scale must be positive")
     if not np.allclose(policy.action_scale, _action_scale(policy.metadata), rtol=1e-6, atol=0):
         raise PolicyFileError(f"{name}: action_scale differs from the metadata's action_reach")
-    _check_gru(policy, name, size, controller.units)
-    width = size + controller.units
+    _check_gru(policy, name, size, interface.units)
+    width = size + interface.units
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         last = number == len(policy.weights) - 1
-        width += controller.units if last else 0
+        width += interface.units if last else 0
         out = 2 * ACTION_SIZE if last else (weight.shape[1] if weight.ndim == 2 else -1)
         _check_array(name, f"weight_{number}", weight, (width, out))
         _check_array(name, f"bias_{number}", bias, (out,))

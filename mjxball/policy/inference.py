@@ -12,12 +12,12 @@ import numpy as np
 from mjxball.arrays import Array, real_numbers
 from mjxball.config import Plant
 from mjxball.control import observation as layout
-from mjxball.control.follower_controller import FollowerController
 from mjxball.control.followers import OneThread, check_batch, checked_observation
 from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
+from mjxball.control.network_interface import NetworkInterface
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, controller_of, load_file
+from mjxball.policy.file import PolicyFile, interface_of, load_file
 
 ROUNDED = 1e-5  # tolerance for a GRU's state beyond 1, from rounding
 
@@ -38,7 +38,7 @@ def known_geometry(metadata: dict[str, Any], name: str) -> np.ndarray | None:
     Raises InputError if it needs geometry that the metadata do not contain.
     """
     team = metadata.get("team")
-    return _geometry_for(name, controller_of(metadata), None if team is None else np.array(team["context"]))
+    return _geometry_for(name, interface_of(metadata), None if team is None else np.array(team["context"]))
 
 
 class Policy:
@@ -64,8 +64,8 @@ class Policy:
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
         gru: Any = None if contents.gru is None else tuple(np.ascontiguousarray(part, dtype) for part in contents.gru)
         self._network = Network(self._weights, self._biases, self._mean, self._scale, gru)
-        self._controller = controller_of(metadata)
-        known = self._controller.geometry and "team" in metadata
+        self._interface = interface_of(metadata)
+        known = self._interface.geometry and "team" in metadata
         self._geometry: Array | None = np.array(metadata["team"]["context"], dtype) if known else None
         self._memory: Array | None = None
         self._thread = OneThread()
@@ -81,7 +81,7 @@ class Policy:
         }
         return {
             **run,
-            "GRU": self._controller.units or None,
+            "GRU": self._interface.units or None,
             "layers": layers,
             "period": f"{1e3 * self.control_period:g} ms",
         }
@@ -109,7 +109,7 @@ class Policy:
 
     def join(self, plant: Plant) -> None:
         """Set the geometry of the team on `plant`, if the policy takes it. Must precede the first call."""
-        if self._controller.geometry:
+        if self._interface.geometry:
             self._geometry = geometry_of(plant).astype(self._dtype)
 
     def reset(self) -> None:
@@ -123,7 +123,7 @@ class Policy:
 
     @property
     def memory(self) -> Array:
-        """Memory (..., m), see `control.follower_controller.FollowerController`; None before the first call."""
+        """Memory (..., m), see `control.network_interface.NetworkInterface`; None before the first call."""
         return self._memory
 
     @memory.setter
@@ -135,14 +135,14 @@ class Policy:
     @property
     def hidden(self) -> Array | None:
         """State of the GRU (..., H) in [-1, 1], a part of `memory`; None without a GRU or before the first call."""
-        memory = self.memory if self._controller.units else None
-        return None if memory is None else self._controller.hidden(memory)
+        memory = self.memory if self._interface.units else None
+        return None if memory is None else self._interface.hidden(memory)
 
     def __getstate__(self) -> dict[str, Any]:
         """State of a copy, which may be used in another thread."""
         return {**self.__dict__, "_thread": OneThread()}
 
-    def scaled(self, observation: Array) -> Array:
+    def action(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18); updates the memory."""
         return np.asarray(self._answer(observation)[0], self._dtype)
 
@@ -157,7 +157,7 @@ class Policy:
     def _answer(self, observation: Array) -> tuple[Array, Array]:
         """(action in [-1, 1], command) for `observation`; updates the memory."""
         observation = checked_observation(observation).astype(self._dtype, copy=False)
-        remembers = self._controller.size > 0
+        remembers = self._interface.size > 0
         if remembers:
             self._thread.check(self.name)
         controller, memory = self.controller, self.memory if remembers else None
@@ -175,14 +175,14 @@ class Policy:
 
     def _checked(self, memory: Array) -> Array:
         """A copy of `memory`. Raises InputError unless it can be a memory of this policy."""
-        given, size = real_numbers(memory, f"a memory of policy {self.name}"), self._controller.size
+        given, size = real_numbers(memory, f"a memory of policy {self.name}"), self._interface.size
         if given.shape[-1:] != (size,):
             raise InputError(f"policy {self.name} remembers {size} numbers, not an array of shape {given.shape}")
         with np.errstate(over="ignore"):
             copied = np.array(given, self._dtype)
         if not np.isfinite(copied).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
-        if (np.abs(self._controller.hidden(copied)) > 1 + ROUNDED).any():
+        if (np.abs(self._interface.hidden(copied)) > 1 + ROUNDED).any():
             raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
         return copied
 
@@ -198,7 +198,7 @@ class NetworkController:
     def __init__(self, policy: Policy):
         self.name = policy.name
         self._network = policy._network
-        self._controller = policy._controller
+        self._interface = policy._interface
         self._geometry = policy._geometry
 
     def start(self, observation: Array) -> Array:
@@ -206,15 +206,15 @@ class NetworkController:
 
         Raises InputError if it needs a geometry that is not set, or is set for another number of followers.
         """
-        geometry = _geometry_for(self.name, self._controller, self._geometry)
+        geometry = _geometry_for(self.name, self._interface, self._geometry)
         if geometry is not None and geometry.ndim > 1 and observation.shape[-2:-1] != geometry.shape[:1]:
             joined = f"policy {self.name} joined a team of {len(geometry)} followers (Policy.join)"
             raise InputError(f"{joined}, and an observation of shape {observation.shape} is not of so many")
-        return self._controller.start(observation, geometry)
+        return self._interface.start(observation, geometry)
 
     def hidden(self, memory: Array) -> Array:
         """State (..., H) of the network's GRU in `memory` (..., m)."""
-        return self._controller.hidden(memory)
+        return self._interface.hidden(memory)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
@@ -223,17 +223,17 @@ class NetworkController:
 
     def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
-        network_input = self._controller.network_input(observation, memory) if self._controller.size else observation
+        network_input = self._interface.network_input(observation, memory) if self._interface.size else observation
         output = self._network.like(observation)(network_input)
         command, after = (
-            self._controller.command(output, observation),
-            self._controller.next(memory, observation, output),
+            self._interface.command(output, observation),
+            self._interface.next(memory, observation, output),
         )
         return output[..., : layout.ACTION_SIZE], command, after
 
 
-def _geometry_for(name: str, controller: FollowerController, geometry: Array | None) -> Array | None:
-    """`geometry`. Raises InputError if it is None and `controller` needs it."""
-    if controller.geometry and geometry is None:
+def _geometry_for(name: str, interface: NetworkInterface, geometry: Array | None) -> Array | None:
+    """`geometry`. Raises InputError if it is None and `interface` needs it."""
+    if interface.geometry and geometry is None:
         raise InputError(f"policy {name} must know its team before it flies (Policy.join)")
     return geometry

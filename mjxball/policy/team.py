@@ -13,7 +13,7 @@ from mjxball.config import Config
 from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, controller_of
+from mjxball.policy.file import PolicyFile, interface_of
 from mjxball.policy.inference import geometry_of, missing_team_error
 
 CRAZYFLIES = Path("crazyflie")  # default plant of a policy for any rig
@@ -21,7 +21,7 @@ CRAZYFLIES = Path("crazyflie")  # default plant of a policy for any rig
 
 def is_for_any(metadata: dict[str, Any]) -> bool:
     """Whether `metadata` is that of a policy for any rig that has not been adapted to one."""
-    return controller_of(metadata).geometry and "team" not in metadata
+    return interface_of(metadata).geometry and "team" not in metadata
 
 
 def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | None = None) -> PolicyFile:
@@ -30,7 +30,7 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
     Its metadata then have `team`, and the plant and configuration of that team. Raises InputError if `config` or
     `drone` do not fit.
     """
-    if not controller_of(policy.metadata).geometry:
+    if not interface_of(policy.metadata).geometry:
         if config is not None or drone is not None:
             raise InputError(f"{name} knows nothing of its team: leave --plant and --drone out")
         return policy

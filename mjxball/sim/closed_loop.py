@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import Load, PlantState, Scalar, Vector
-    from mjxball.physics.step import ControlStep
+    from mjxball.physics.step import PlantStep
     from mjxball.plant import PlantParameters
     from mjxball.sim.controllers import Integral
     from mjxball.sim.disturbances import Observation, Sample, SensorModel, SensorState
@@ -43,10 +43,10 @@ class ClosedLoop(Controllers):
     """Controllers with sensors and physics: call `start`, then `step` repeatedly; shapes as in `Controllers`."""
 
     def __init__(
-        self, config: Config, physics: ControlStep, sensors: SensorModel, parameters: PlantParameters | None = None
+        self, config: Config, plant_step: PlantStep, sensors: SensorModel, parameters: PlantParameters | None = None
     ):
         super().__init__(config, parameters)
-        self._physics, self._sensors = physics, sensors
+        self._plant_step, self._sensors = plant_step, sensors
         self._period = config.timing.control_period
         self._leader_measures = config.scenario.leader_uses_measurements
 
@@ -75,41 +75,30 @@ class ClosedLoop(Controllers):
         goals: tuple[Vector, Vector],
         sample: Sample,
         on_pid: Scalar | float = 1.0,
-        physics: ControlStep | None = None,
+        plant_step: PlantStep | None = None,
     ) -> tuple[LoopState, Observation, TeamCommands]:
         """One control period: (state, observation at its end, commands).
 
         `follower` is the followers' answer to `observation`, in their mount frames. `goals` are those of O at the
         beginning and the end of the period [m]. `load` includes the external force during the period; `sample` disturbs
         the measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
-        (`follower.residual_on_pid`), 0 for a follower whose command is complete. `physics` replaces the loop's physics.
+        (`follower.residual_on_pid`), 0 for a follower whose command is complete. `plant_step` replaces the loop's own.
         """
-        measured = self._leader_body(state, observation, goals[0])
-        commands = self._commands(measured, state.integral, follower, goals[0], on_pid)
-        plant = (physics or self._physics)(state.plant, self.stack(*commands), load)
+        leader_sees = self._leader_body(state, observation, goals[0])
+        commands = self._commands(leader_sees, state.integral, follower, goals[0], on_pid)
+        plant = (plant_step or self._plant_step)(state.plant, self.stack(*commands), load)
         diverged = state.diverged | has_diverged(plant)
         if not (isinstance(diverged, np.ndarray | np.generic) and not diverged.any()):
             plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
         on_pid = np.asarray(on_pid)[..., None]
-        integral = self.integrate(state.integral, measured, goals[0], self._period, on_pid, commands.follower)
+        integral = self.integrate(state.integral, leader_sees, goals[0], self._period, on_pid, commands.follower)
         sensors, observation = self._sensors.step(state.sensors, self.observe(plant, goals[1]), sample)
         return LoopState(plant, integral, sensors, diverged), observation, commands
 
-    def commands(
-        self,
-        state: LoopState,
-        observation: Observation,
-        follower: FollowerCommand,
-        goal: Vector,
-        on_pid: Scalar | float = 1.0,
-    ) -> TeamCommands:
-        """All commands at `observation`; arguments as for `step`."""
-        return self._commands(self._leader_body(state, observation, goal), state.integral, follower, goal, on_pid)
-
     def _commands(
-        self, measured: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
+        self, leader_sees: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
     ) -> TeamCommands:
-        leader_command = self.leader_command(measured, goal, integral)
+        leader_command = self.leader_command(leader_sees, goal, integral)
         follower = self.in_body_axes(follower)
         if not self._on_pid:
             return TeamCommands(leader_command, follower)
@@ -119,6 +108,7 @@ class ClosedLoop(Controllers):
         )
 
     def _leader_body(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
+        """The body by its measurements, or the true one if `scenario.leader_uses_measurements` is off."""
         return self.body_from_observation(observation, goal) if self._leader_measures else state.plant
 
 

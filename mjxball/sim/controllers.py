@@ -1,4 +1,4 @@
-"""Laws of all drones, which simulation and flight call alike: the leader's PID, shared integrals, stands.
+"""Controllers of all drones, which simulation and flight call alike: the leader's PID, shared integrals, stands.
 
 Importing it needs NumPy alone.
 """
@@ -59,7 +59,7 @@ class Body(Protocol):
 
 
 class Controllers:
-    """Laws of all drones for one configuration, on arrays of any batch shape and namespace.
+    """Controllers of all drones for one configuration, on arrays of any batch shape and namespace.
 
     Of several followers, F = N - 1, observations are (..., F, 18) and commands (..., F, 3), in the order of
     `plant.followers`; a pair's one follower has no such axis. Followers see and command in their mount frames
@@ -78,7 +78,7 @@ class Controllers:
     """
 
     def __init__(self, config: Config, parameters: PlantParameters | None = None):
-        self._controller, self._gravity = config.leader, config.plant.gravity
+        self._leader_settings, self._gravity = config.leader, config.plant.gravity
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._on_pid = config.follower.residual_on_pid
         self._tilt_integral_gain = config.leader.tilt_integral_gain
@@ -165,7 +165,7 @@ class Controllers:
         """(error, its rate) on which the leader flies."""
         if self._free is not None:
             state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
-        if self._controller.error == "object":
+        if self._leader_settings.error == "object":
             return goal - state.position, -state.velocity
         error, rate = self._leader_place_error(state, goal)
         return self._along_free_axes(error), self._along_free_axes(rate)
@@ -191,9 +191,9 @@ class Controllers:
         `follower_command`: what a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()
-        band = xp.asarray(self._controller.integral_error_limit, dtype=goal.dtype)
+        band = xp.asarray(self._leader_settings.integral_error_limit, dtype=goal.dtype)
         error, rate = self.leader_error(state, goal)
-        lead = self._controller.integral_lead_time
+        lead = self._leader_settings.integral_lead_time
         error = error + lead * rate if lead else error
         own = integral[..., :3] + period * clipped(error, -band, band)
         if not self._on_pid:
@@ -221,14 +221,14 @@ class Controllers:
         """A network's `command` in body axes, which includes the PD controller's, with its share of integrals."""
         if not self._on_pid:
             return command
-        xp, controller = command.__array_namespace__(), self._controller
+        xp, controller = command.__array_namespace__(), self._leader_settings
         ki = xp.asarray(controller.ki, dtype=command.dtype)
         more = leader.command(ki * integral[..., :3], 0.0, self._gravity, *self._limits)
         return self._clip(self._with_lift_difference(command + more - integral[..., 4:], integral, -self._lift_sign))
 
     def _pid_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         error, rate = self.leader_error(state, goal)
-        gains = self._controller.kp, self._controller.kd, self._controller.ki
+        gains = self._leader_settings.kp, self._leader_settings.kd, self._leader_settings.ki
         return leader.pid_command(error, rate, integral[..., :3], gains, self._gravity, *self._limits)
 
     def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from mjxball.config import Config
-from mjxball.control.follower_controller import FollowerController
+from mjxball.control.network_interface import NetworkInterface
 from mjxball.control.observation import observation_history
 
 
-def follower_controller(config: Config) -> FollowerController:
+def network_interface(config: Config) -> NetworkInterface:
     """Observation history, action scaling and limits around the network of `config.follower`."""
     follower, leader = config.follower, config.leader
-    return FollowerController(
+    return NetworkInterface(
         history=observation_history(config),
         action_scale=(follower.action_scale_tilt, follower.action_scale_vertical),
         limits=(config.command.tilt_limit, config.command.vertical_limit),

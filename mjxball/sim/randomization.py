@@ -37,7 +37,7 @@ LISSAJOUS = 0.3  # probability that the CG's second sine is twice as fast, where
 PLACES = 16  # random waypoints of a CG before it starts over
 
 
-class Rig(NamedTuple):
+class SampledRig(NamedTuple):
     """The rig of an environment with random rigs."""
 
     parameters: PlantParameters  # padded to the plant's drones
@@ -84,7 +84,7 @@ class ResetDistribution:
         rng: Array,
         number: Int[Array, ""] | None = None,
         chosen: rigs.RigTable | None = None,
-    ) -> tuple[Load, PlantState, Vector, Rig | None]:
+    ) -> tuple[Load, PlantState, Vector, SampledRig | None]:
         """(load, plant nearly at rest, goal (3,) of O [m], the environment's rig if rigs are random).
 
         `number` sets the team's size; None: any of `scenario.team_sizes`. `chosen` is the rig, if given.
@@ -147,7 +147,7 @@ class ResetDistribution:
         )
         return load, plant, symmetric(scenario.goal_range), rig
 
-    def _with_rig_load(self, load: Load, rig: Rig, key: Array) -> Load:
+    def _with_rig_load(self, load: Load, rig: SampledRig, key: Array) -> Load:
         """`load` with the masses, thrusts and CG reach of the row in `rig`."""
         row: Any = rig.row
         far, stepped = jax.random.uniform(key, (2,))
@@ -163,7 +163,7 @@ class ResetDistribution:
             thrust_fade=row.thrust_fade,
         )
 
-    def trimmed(self, load: Load, rig: Rig | None = None) -> Scalar:
+    def trimmed(self, load: Load, rig: SampledRig | None = None) -> Scalar:
         """CG amplitude [m] that can be trimmed before and after the mass changes; negative: none."""
         if rig is not None and rig.row is not None:  # the amplitude was sampled within it
             return load.cg_amplitude
@@ -215,7 +215,7 @@ class ResetDistribution:
             load = jax.tree.map(functools.partial(jnp.where, self.trimmed(load) < 0), milder, load)
         return load
 
-    def _rig(self, key: Array, number: Int[Array, ""] | None) -> Rig:
+    def _rig(self, key: Array, number: Int[Array, ""] | None) -> SampledRig:
         """A rig with random factors; `number` sets the team's size, None takes any."""
         plant, attitude = self.config.plant, self.config.attitude
         index = jax.random.randint(jax.random.fold_in(key, 1), (), 0, len(self._sizes)) if number is None else number
@@ -230,19 +230,19 @@ class ResetDistribution:
         factors = teams.Factors(*(low + (high - low) * u for (low, high), u in zip(self._ranges, samples, strict=True)))
         parameters = teams.varied(parameters, factors, attitude, share * attitude.design_object_mass)
         flies = (jnp.arange(plant.count) < size).astype(jnp.float32)
-        return Rig(parameters, flies, parameters.ball_limit / self._constants.ball_limit, share)
+        return SampledRig(parameters, flies, parameters.ball_limit / self._constants.ball_limit, share)
 
-    def _random_row(self, key: Array, index: Int[Array, ""]) -> Rig:
+    def _random_row(self, key: Array, index: Int[Array, ""]) -> SampledRig:
         """Any of the tabulated rigs of the size `index`."""
         number = jax.random.randint(key, (), 0, self.config.rigs.number)
         return self._rig_of_row(jax.tree.map(lambda part: jnp.asarray(part, jnp.float32)[index, number], self._table))
 
-    def _rig_of_row(self, row: rigs.RigTable) -> Rig:
+    def _rig_of_row(self, row: rigs.RigTable) -> SampledRig:
         flies = (jnp.arange(self.config.plant.count) < row.size).astype(jnp.float32)
         one = jnp.ones(())
-        return Rig(rigs.whole(row.parameters, self.config.plant.gravity), flies, one, one, row)
+        return SampledRig(rigs.whole(row.parameters, self.config.plant.gravity), flies, one, one, row)
 
-    def _with_plane_path(self, load: Load, key: Array, rig: Rig | None) -> Load:
+    def _with_plane_path(self, load: Load, key: Array, rig: SampledRig | None) -> Load:
         """`load` with a random path of the CG in the plane, within the carrier and what can be trimmed."""
         scenario = self.config.scenario
         turn, wide, late, kind = jax.random.uniform(key, (4,))
@@ -261,7 +261,7 @@ class ResetDistribution:
             limit = jnp.minimum(cg_limit(self.config.plant) * proportion, limit)
         return load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude * proportion, limit / longest), cg_shape=shape)
 
-    def _with_loss(self, load: Load, key: Array, rig: Rig | None) -> Load:
+    def _with_loss(self, load: Load, key: Array, rig: SampledRig | None) -> Load:
         """`load` in which the rotors of a follower may stop, with the CG within what the others can then trim.
 
         No rotor stops if no CG could be trimmed afterwards, unless `trim_margin` is negative; then the CG stays at O.

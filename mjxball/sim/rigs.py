@@ -99,13 +99,13 @@ def sample_rigs(config: Config, size: int, count: int, seed: int) -> SampledRigs
             untrimmed + (steady & ~held)[:last].sum(),
         )
         parts.append(table.rows(np.flatnonzero(good[:last])))
-    return SampledRigs(joined(parts), int(candidates), int(damped), int(untrimmed))
+    return SampledRigs(concatenated(parts), int(candidates), int(damped), int(untrimmed))
 
 
 def training_rigs(config: Config) -> RigTable:
     """`rigs.number` rigs of each of `scenario.team_sizes`, (sizes, number, ...), in float32."""
     sampled = [sample_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
-    table = joined(sampled)
+    table = concatenated(sampled)
     shape = (len(sampled), config.rigs.number)
 
     def folded(part: Array) -> Array:
@@ -120,7 +120,7 @@ def held_out(config: Config, size: int, count: int = HELD_OUT_RIGS) -> RigTable:
     return unpadded(sample_rigs(config, size, count, HELD_OUT).rigs, size)
 
 
-def joined(tables: list[RigTable]) -> RigTable:
+def concatenated(tables: list[RigTable]) -> RigTable:
     """The rigs of all `tables`, one table after the other."""
     parameters = _each(lambda *parts: np.concatenate(parts), *(table.parameters for table in tables))
     return RigTable(parameters, *(np.concatenate(parts) for parts in zip(*(t[1:] for t in tables), strict=True)))

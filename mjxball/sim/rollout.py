@@ -15,11 +15,11 @@ from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches, coordinates, total_wrench
-from mjxball.physics.motion import make_prescribed, object_mass
+from mjxball.physics.motion import make_cg_motion, object_mass
 from mjxball.physics.step import (
     make_accelerations,
     make_cg_offset,
-    make_stepper,
+    make_numpy_plant_step,
     start_state,
     with_external_force,
 )
@@ -141,7 +141,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
     on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
     privileged = make_privileged_info(config) if not on_pid.all() else lambda *_: None
-    loop = ClosedLoop(config, make_stepper(config, physics), flown.sensors)
+    loop = ClosedLoop(config, make_numpy_plant_step(config, physics), flown.sensors)
     state, observation = loop.start(flown.start, inputs.goal[0], flown.first, flown.delays)
     carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
     for number in range(len(inputs.time)):
@@ -205,7 +205,7 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
     angles, several = mount_angles(plant), len(plant.followers) > 1
     ahead = 0.5 * config.timing.control_period + plant.rotor_lag
     drones = sum(drone.mass for drone in plant.drones) + plant.carrier_mass
-    prescribed = None if config.motion.kind == "rolling" else make_prescribed(config)
+    prescribed = None if config.motion.kind == "rolling" else make_cg_motion(config)
 
     def privileged(state: PlantState, load: Load) -> PrivilegedInfo:
         xp = state.time.__array_namespace__()

@@ -29,7 +29,7 @@ class Statistics(NamedTuple):
     peaks: dict[str, Float[Array, " envs"]]  # maximum of each metric over steps
 
 
-def joined(first: Statistics, second: Statistics) -> Statistics:
+def added(first: Statistics, second: Statistics) -> Statistics:
     """Statistics over the steps of both."""
     return Statistics(
         reward=first.reward + second.reward,
@@ -202,7 +202,7 @@ class Environments:
             after = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])
         totals = {name: values.sum() for name, values in after.metrics.items()}
-        statistics = joined(envs.statistics, Statistics(after.reward.mean(), terminated.sum(), totals, after.metrics))
+        statistics = added(envs.statistics, Statistics(after.reward.mean(), terminated.sum(), totals, after.metrics))
         transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
         stepped = Envs(after, statistics)
         if fresh is not None:

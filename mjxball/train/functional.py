@@ -137,13 +137,13 @@ def _in_turns(
 
 def _phases(program: TrainingProgram, evaluate: bool) -> Mode:
     """Stacked modes of a whole training: the warm-up, then training and evaluation alternating, or training alone."""
-    first, total = program.warmup_rounds, max(program.total_rounds, program.warmup_rounds)
+    first, total = program.warmup_steps_each, max(program.total_steps_each, program.warmup_steps_each)
     window = program.algorithm.steps_per_collect
     stretches = program.schedule.num_evaluations if evaluate else 1
     ends = np.round(np.linspace(first, total, stretches + 1) / window).astype(int) * window
-    modes = [programs.warmup(first)]
+    modes = [programs.warmup_mode(first)]
     for steps in np.diff(ends):
-        modes += [programs.train(int(steps)), programs.evaluate(program.evaluation_steps)][: 1 + evaluate]
+        modes += [programs.train_mode(int(steps)), programs.evaluate_mode(program.evaluation_steps)][: 1 + evaluate]
     return Mode(
         np.stack([mode.steps for mode in modes]),
         TrainingPhase(*(np.stack(list(flags)) for flags in zip(*(mode.phase for mode in modes), strict=True))),

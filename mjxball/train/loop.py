@@ -43,10 +43,10 @@ def learn(run: Run, stop: Stop) -> bool:
     pause = (lambda: stop.requested) if jax.process_count() == 1 else lambda: False
     (ended,) = processes.any_of((stop.requested,))
     if run.done < plan.warmup and not ended:
-        run.advance(programs.warmup(plan.warmup - run.done))
+        run.advance(programs.warmup_mode(plan.warmup - run.done))
     while run.done < plan.total and not ended:
         goal, evaluates = plan.next(run.done)
-        chunk = run.advance(programs.train(goal - run.done), pause)
+        chunk = run.advance(programs.train_mode(goal - run.done), pause)
         if waiting:
             run.progress.show(run.row(waiting))
         # A chunk that was cut short has no row; the resumed run writes one for its rest.
@@ -74,9 +74,9 @@ class Plan(NamedTuple):
     @classmethod
     def of(cls, program: TrainingProgram) -> Plan:
         """The plan of a program's schedule."""
-        total, window = program.total_rounds, program.algorithm.steps_per_collect
+        total, window = program.total_steps_each, program.algorithm.steps_per_collect
         chunk = math.ceil(total / CHUNKS / window) * window
-        return cls(program.warmup_rounds, total, chunk, program.schedule.num_evaluations)
+        return cls(program.warmup_steps_each, total, chunk, program.schedule.num_evaluations)
 
     def next(self, done: int) -> tuple[int, bool]:
         """(steps at the end of the chunk that contains step `done`, whether an evaluation follows it)."""

@@ -22,7 +22,7 @@ from mjxball.train import processes
 from mjxball.train.compilation import Carrying, TracedProgram, compiler_options, jax_setting, partitioned_by_gspmd
 from mjxball.train.environments import Statistics, report
 from mjxball.train.extensions import DEFAULTS, Extensions
-from mjxball.train.program import Mode, TrainingProgram, TrainState, train, warmup
+from mjxball.train.program import Mode, TrainingProgram, TrainState, train_mode, warmup_mode
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
@@ -140,7 +140,7 @@ class Population:
     def _lower_here(self, creating: bool) -> Iterator[Any]:
         """Lowered collect, update, episodes and, if `creating`, begin, for one device."""
         key, state = self._key, self.template()
-        values, keys, phase = jax.tree.map(_shape, (*self._starts(0), warmup(1).phase))
+        values, keys, phase = jax.tree.map(_shape, (*self._starts(0), warmup_mode(1).phase))
         collect = lambda: (state, jax.tree.map(_shape, self.no_statistics()), phase)  # noqa: E731
         yield TracedProgram("collect", key, self._collect, collect, others=len(phase)).lower_carrying()
         update = lambda: (state, _shape(self._example_keys()))  # noqa: E731
@@ -170,7 +170,7 @@ class Population:
         """The same as `_lower_here` for several devices."""
         values, keys = self._starts(0)
         state, statistics = self._placed_shapes(self.template(), self._state_spec), self.no_statistics()
-        phase = self._as_argument(warmup(1).phase, PartitionSpec())
+        phase = self._as_argument(warmup_mode(1).phase, PartitionSpec())
         update_keys = self._as_argument(self._example_keys(), self._whole)
         carried = (self._state_spec, self._statistics_spec)
         yield self._carrying(self._collect, (state, statistics, phase), (*carried, self._whole), 2)
@@ -312,7 +312,7 @@ class Population:
         return self._on_mesh(collect, given, results, (0, 0, None))(self._values, state, statistics, phase)
 
     def _update(self, state: TrainState, keys: Array) -> tuple[TrainState, dict[str, Array]]:
-        learning = train(1).phase
+        learning = train_mode(1).phase
         update = lambda program, state, keys: program.update(state, keys, learning)  # noqa: E731
         specs = self._state_spec, self._whole
         return self._on_mesh(update, specs, specs, (0, 0))(self._values, state, keys)

@@ -15,7 +15,7 @@ from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
 from mjxball.algorithms.base import Algorithm, PolicyNetwork, Schedule, Shards, TrainingPhase
 from mjxball.config import Config
-from mjxball.train.environments import Environments, Statistics, joined
+from mjxball.train.environments import Environments, Statistics, added
 from mjxball.train.extensions import DEFAULTS, Extensions, find, is_transport_env, make_env
 
 if TYPE_CHECKING:
@@ -33,17 +33,17 @@ class Mode(NamedTuple):
     phase: TrainingPhase
 
 
-def warmup(steps: int) -> Mode:
+def warmup_mode(steps: int) -> Mode:
     """Mode with random actions, which are recorded."""
     return _mode(steps, random=True, evaluate=False)
 
 
-def train(steps: int) -> Mode:
+def train_mode(steps: int) -> Mode:
     """Mode with actions sampled from the policy, which are recorded, and updates."""
     return _mode(steps, random=False, evaluate=False)
 
 
-def evaluate(steps: int) -> Mode:
+def evaluate_mode(steps: int) -> Mode:
     """Mode with the policy's mean action. Nothing is recorded or learnt."""
     return _mode(steps, random=False, evaluate=True)
 
@@ -142,7 +142,7 @@ class TrainingProgram:
         taken = self.schedule.num_envs * algorithm.steps_per_collect
         steps = state.steps + jnp.where(phase.recording, taken, 0)
         collected = self.environments.over_shards(envs.statistics)
-        return TrainState(learnt, envs.states, keys[-1], steps), joined(statistics, collected), keys
+        return TrainState(learnt, envs.states, keys[-1], steps), added(statistics, collected), keys
 
     def update(
         self, state: TrainState, keys: Array, phase: TrainingPhase
@@ -182,11 +182,11 @@ class TrainingProgram:
         return episodes * reward / begun
 
     @property
-    def total_rounds(self) -> int:
+    def total_steps_each(self) -> int:
         """Steps of each environment in the whole training."""
         return math.ceil(self.schedule.total_steps / self.schedule.num_envs)
 
     @property
-    def warmup_rounds(self) -> int:
+    def warmup_steps_each(self) -> int:
         """Steps of each environment with random actions; part of `total_rounds`."""
         return math.ceil(self.schedule.warmup_steps / self.schedule.num_envs)

@@ -21,7 +21,7 @@ from mjxball.config import Config
 from mjxball.errors import TrainingDivergedError
 from mjxball.policy import save_file
 from mjxball.policy.export import is_sound, network_file, policy_file
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 from mjxball.train import lock, processes
 from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
@@ -248,7 +248,7 @@ class Run:
         keys = processes.gather(training.key)
         envs = population.evaluation_envs(self._compiled)
         evaluated = training._replace(envs=envs, key=population.place_keys(keys))
-        after, statistics, *_ = population.advance(self._compiled, evaluated, programs.evaluate(steps))
+        after, statistics, *_ = population.advance(self._compiled, evaluated, programs.evaluate_mode(steps))
         statistics = processes.gather(statistics)
         self.state = after._replace(envs=training.envs, key=population.place_keys(keys))
         reward, ended = population.each(statistics.reward), population.each(statistics.ended)
@@ -305,7 +305,7 @@ class Run:
             if not is_transport_env(self.population.program.env):  # a policy file has the layout of our observation
                 exported |= network_file(self._network_path(member), learnt, steps, origin)
                 continue
-            policy = policy_file(config, follower_controller(config), learnt, steps, origin)
+            policy = policy_file(config, network_interface(config), learnt, steps, origin)
             if not is_sound(policy):
                 continue
             exported = True

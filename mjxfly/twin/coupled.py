@@ -98,7 +98,7 @@ class CoupledPair:
         self._share = plant.moving_fraction
         self._rolling = config.motion.kind == "rolling"
         self._roll_force = motion.make_rolling_force(config)
-        self._prescribed = None if self._rolling else motion.make_prescribed(config)
+        self._prescribed = None if self._rolling else motion.make_cg_motion(config)
         load = self.conditions
         mass, amplitude, speed, zero = map(np.float64, (load.object_mass, load.cg_amplitude, load.cg_speed, 0.0))
         self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))

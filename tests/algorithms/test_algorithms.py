@@ -27,7 +27,7 @@ from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.policy.export import policy_file
 from mjxball.policy.file import PolicyFile, load_file, shipped_policy
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 from mjxball.train import program as programs
 from mjxball.train.environments import Environments
 from mjxball.train.extensions import Extensions, find
@@ -225,11 +225,12 @@ def test_the_first_window_normalises_the_observations(transport: Config) -> None
 def returns(config: Config, name: str, env: Any, seed: int = 0) -> np.ndarray:
     """Mean reward a step of the policy after the whole training, and of the one before it."""
     program = TrainingProgram(config, "newton-euler", extensions=Extensions(env, None, find(name, "--algorithm")))
-    advance, evaluate = jax.jit(program.advance), programs.evaluate(80)
+    advance, evaluate = jax.jit(program.advance), programs.evaluate_mode(80)
     state = jax.jit(program.create)(jax.random.PRNGKey(seed))
     fresh = program.evaluation_envs(jax.random.PRNGKey(7))
     found = []
-    for mode in (programs.warmup(program.warmup_rounds), programs.train(program.total_rounds - program.warmup_rounds)):
+    warmup = program.warmup_steps_each
+    for mode in (programs.warmup_mode(warmup), programs.train_mode(program.total_steps_each - warmup)):
         state, *_ = advance(state, mode)
         found.append(float(advance(state._replace(envs=fresh), evaluate)[1].reward) / 80)
     return np.array(found)
@@ -269,14 +270,14 @@ def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     extensions = Extensions(toys.DoubleIntegrator, None, find(name, "--algorithm"))
     program = TrainingProgram(config, "newton-euler", extensions=extensions)
     advance, window = jax.jit(program.advance), program.algorithm.steps_per_collect
-    start, *_ = advance(jax.jit(program.create)(jax.random.PRNGKey(0)), programs.warmup(program.warmup_rounds))
-    once, *_ = advance(start, programs.train(4 * window))
-    half, *_ = advance(start, programs.train(window))
+    start, *_ = advance(jax.jit(program.create)(jax.random.PRNGKey(0)), programs.warmup_mode(program.warmup_steps_each))
+    once, *_ = advance(start, programs.train_mode(4 * window))
+    half, *_ = advance(start, programs.train_mode(window))
     kept = jax.tree.map(np.asarray, half)  # as a checkpoint keeps it
-    twice, *_ = advance(kept, programs.train(3 * window))
+    twice, *_ = advance(kept, programs.train_mode(3 * window))
     jax.tree.map(np.testing.assert_array_equal, once, twice)
     # An evaluation changes nothing of the policy.
-    seen, *_ = advance(once, programs.evaluate(2 * window))
+    seen, *_ = advance(once, programs.evaluate_mode(2 * window))
     jax.tree.map(np.testing.assert_array_equal, program.policy(once), program.policy(seen))
 
 
@@ -324,7 +325,7 @@ def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
     """A policy file, made into what is trained and back, gives the same commands to float32."""
     algorithm = FirstOrderGradient(recurrent.config, Environments(TransportEnv(recurrent.config, "newton-euler"), 4))
     begun = algorithm.start_from(algorithm.init(jax.random.key(0)), recurrent.contents)
-    again = policy_file(recurrent.config, follower_controller(recurrent.config), algorithm.policy(begun), steps=0)
+    again = policy_file(recurrent.config, network_interface(recurrent.config), algorithm.policy(begun), steps=0)
     observations = np.random.default_rng(1).normal(size=(50, 18))
     old, new = (Policy(one, "one", np.float64) for one in (recurrent.contents, again))
     np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)

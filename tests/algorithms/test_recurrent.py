@@ -352,7 +352,7 @@ def answers(contents: PolicyFile) -> np.ndarray:
     """Actions on a walk of observations."""
     policy, random = Policy(contents, "one", np.float64), np.random.default_rng(3)
     walk = np.cumsum(random.normal(scale=0.03, size=(20, 18)), axis=0)
-    return np.array([policy.scaled(seen) for seen in walk])
+    return np.array([policy.action(seen) for seen in walk])
 
 
 def test_settings_reach_the_network(transport: Config) -> None:

@@ -16,7 +16,7 @@ from mjxball.control import crazyflie
 from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.motors import OLDER, with_curve
 from mjxball.errors import InputError
-from mjxball.physics.step import hover_rotor_force, make_stepper
+from mjxball.physics.step import hover_rotor_force, make_numpy_plant_step
 from mjxball.sim.rollout import load_of, simulate_batch, start_of
 from mjxball.sim.scenario import Scenario
 
@@ -84,7 +84,8 @@ def test_model_moves_as_the_simulator(command: tuple[float, float]) -> None:
     """A command stepped from hover, for 0.3 s: the model without delay against the full physics."""
     config, model = FLIGHT, linear_model(FLIGHT, 0.0)
     scenario = Scenario(mass=0.0175, amplitude=0.0, goal=(0.0, 0.0, 0.0), seconds=1.0)
-    state, load, step = start_of(config, [scenario]), load_of(config, [scenario]), make_stepper(config, "newton-euler")
+    state, load = start_of(config, [scenario]), load_of(config, [scenario])
+    step = make_numpy_plant_step(config, "newton-euler")
     assert state.rotor_force == pytest.approx(hover_rotor_force(config, load.believed_mass))
     transition, drive = linear.discretise(model.a, model.b, config.timing.control_period)
     x = np.zeros(len(model.names))

@@ -23,7 +23,7 @@ from mjxball.policy.container import PolicyFileError
 from mjxball.policy.export import policy_file
 from mjxball.policy.file import save_file
 from mjxball.policy.inference import geometry_of
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 
 TEAM = preset("team")
 ENGINE = "newton-euler"
@@ -60,12 +60,12 @@ def test_turning_a_team_changes_nothing() -> None:
 def test_worlds_of_training_are_told_what_a_flight_is_told() -> None:
     env = TransportEnv(configs.replace(TEAM, "scenario.mount_scale", (1.0, 1.0)), ENGINE)
     world = jax.jit(env.reset)(jax.random.key(0), 1).pipeline_state  # of three drones
-    np.testing.assert_allclose(world.history[:2, -4:], geometry_of(ring(3).plant), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(world.memory[:2, -4:], geometry_of(ring(3).plant), rtol=1e-5, atol=1e-6)
 
 
 def silent(config: Config) -> PolicyFile:
     """A network of zeros."""
-    controller, units = follower_controller(config), config.follower.recurrent_units
+    controller, units = network_interface(config), config.follower.recurrent_units
     size = controller.input_size
     shapes = {"hidden_0": (size + units, 8), "hidden_1": (8 + units, 6)}
     layers = {name: {"kernel": np.zeros(shape), "bias": np.zeros(shape[1])} for name, shape in shapes.items()}

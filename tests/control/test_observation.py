@@ -5,7 +5,7 @@ from euler_angles import matrix_from_euler
 
 from mjxball.control import observation as layout
 from mjxball.control import rotations
-from mjxball.control.follower_controller import FollowerController
+from mjxball.control.network_interface import NetworkInterface
 
 MOUNT = np.array([-0.17, 0.0, 0.0])
 
@@ -87,7 +87,7 @@ def test_residual_adds_to_the_pd_law_and_direct_does_not():
     seen, scaled = seen_with([1.0, 0, 0], [0, 0, 0]), np.array([0.5, -1.0, 0.25])
     reach = (0.2, 2.0)
     direct, residual = (
-        FollowerController(HISTORY, reach, residual=adds, **CONTROLLER).command(scaled, seen) for adds in (False, True)
+        NetworkInterface(HISTORY, reach, residual=adds, **CONTROLLER).command(scaled, seen) for adds in (False, True)
     )
     np.testing.assert_allclose(direct, [0.1, -0.2, 0.5], rtol=1e-15)
     np.testing.assert_allclose(residual, [0.1, -0.2 + 0.05, 0.5], rtol=1e-14)
@@ -96,14 +96,14 @@ def test_residual_adds_to_the_pd_law_and_direct_does_not():
 def test_command_never_leaves_the_shared_limits():
     seen = seen_with([100.0, -100.0, 100.0], [0, 0, 0])
     for scaled in (np.ones(3), -np.ones(3)):
-        command = FollowerController(HISTORY, (0.2, 2.0), **CONTROLLER).command(scaled, seen)
+        command = NetworkInterface(HISTORY, (0.2, 2.0), **CONTROLLER).command(scaled, seen)
         assert (np.abs(command) <= [0.6, 0.6, 6.0]).all()
-    wide = FollowerController(HISTORY, (1.0, 20.0), residual=False, **CONTROLLER).command(np.ones(3), seen)
+    wide = NetworkInterface(HISTORY, (1.0, 20.0), residual=False, **CONTROLLER).command(np.ones(3), seen)
     np.testing.assert_array_equal(wide, [0.6, 0.6, 6.0])
 
 
 def test_a_follower_of_the_load_axis_alone_commands_the_angle_that_the_load_turns():
     """A load along x pitches the pair, one along y rolls it."""
-    assert layout.commanded(False, "x") == (1.0, 1.0, 1.0)
-    assert layout.commanded(True, "x") == (0.0, 1.0, 1.0)
-    assert layout.commanded(True, "y") == (1.0, 0.0, 1.0)
+    assert layout.action_mask(False, "x") == (1.0, 1.0, 1.0)
+    assert layout.action_mask(True, "x") == (0.0, 1.0, 1.0)
+    assert layout.action_mask(True, "y") == (1.0, 0.0, 1.0)

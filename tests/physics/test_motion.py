@@ -19,7 +19,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate.scenarios import read_waveform
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.engine import Engine, Load, PathShape, PlantState, Wrench
-from mjxball.physics.step import jax_repeat, make_control_step, start_state
+from mjxball.physics.step import jax_repeat, make_plant_step, start_state
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -37,7 +37,7 @@ IN_PLANE = {"ellipse": ELLIPSE, "figure of eight": EIGHT, "sine along x": None}
 def test_derivatives_of_paths_in_the_plane(kind: str) -> None:
     time = np.linspace(0.013, 18.9, 400)
     waves = dataclasses.replace(SAMPLES, offsets_across=tuple(reversed(SAMPLES.offsets)))
-    curve = motion.make_prescribed(paper_with(PLATE, waves if kind == "waveform" else Motion()))
+    curve = motion.make_cg_motion(paper_with(PLATE, waves if kind == "waveform" else Motion()))
     none, many = np.zeros((400, 0)), np.full(400, 1.0)
     places = np.broadcast_to(np.stack([PLACES, PLACES[::-1]], axis=-1), (400, len(PLACES), 2))
     load = Load(many, many, 0.1 * many, 0.8 * many, 0.4 * many, none, none, cg_shape=IN_PLANE.get(kind))
@@ -56,7 +56,7 @@ def test_half_an_hour_of_float32_steps_takes_half_an_hour() -> None:
     """The sum of 360 000 steps was 1.60 s too late, and the CG 4.8 rad ahead."""
     config = configs.preset("transport")
     still, period = Engine(lambda *_: (jnp.zeros(3), jnp.zeros(3)), None), config.timing.control_period  # type: ignore[arg-type]
-    step = make_control_step(config, still, jax_repeat, autopilot=lambda state, *_: (None, state.rotor_force))
+    step = make_plant_step(config, still, jax_repeat, autopilot=lambda state, *_: (None, state.rotor_force))
     sines = (0.05, 3.0, 0.5)  # [m], [rad/s], [rad]
     load = Load(*(jnp.asarray(value) for value in (0.2, 0.2, *sines)), jnp.zeros(1), jnp.full(1, jnp.inf))
     begin = start_state(config, *[jnp.zeros(3)] * 3, load.object_mass, jnp.zeros(()))

@@ -12,7 +12,7 @@ from tables import rows
 from mjxball.config import replace
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.physics.step import make_stepper
+from mjxball.physics.step import make_numpy_plant_step
 from mjxball.sim.rollout import load_of, simulate, simulate_batch, start_of
 from mjxball.sim.scenario import Scenario
 from mjxball.sim.trajectory import Trajectory
@@ -64,7 +64,7 @@ def test_mjx_flies_the_same_trajectory(name: str) -> None:
 def test_an_external_force_acts_along_the_world_however_the_pair_is_turned() -> None:
     """F dt / M of velocity after one control step, for the first of which thrust and tilt hardly change."""
     config = paper_with()
-    scenario, step = Scenario(seconds=1), make_stepper(config, "newton-euler")
+    scenario, step = Scenario(seconds=1), make_numpy_plant_step(config, "newton-euler")
     load, start = load_of(config, [scenario]), start_of(config, [scenario])
     turned = start._replace(quaternion=rotations.quaternion_from_euler(np.array([[0.0, 0.0, np.pi / 2]])))
     commands, force = np.zeros((1, 2, 3)), np.array([[0.7, 0.2, -0.4]])

@@ -19,7 +19,7 @@ from mjxball.control import rotations
 from mjxball.env import TransportEnv
 from mjxball.physics import mjx, mujoco, newton_euler
 from mjxball.physics.engine import Load, contact_wrenches, total_wrench
-from mjxball.physics.step import make_control_step, start_state
+from mjxball.physics.step import make_plant_step, start_state
 from mjxball.plant import plant_parameters
 
 STATES = 100
@@ -100,7 +100,7 @@ def test_rotors_may_be_commanded_themselves() -> None:
     """A tenth more than hover: g / 10 upwards, less the rotors' lag T: v = g / 10 (t - T (1 - exp(-t / T)))."""
     config = preset("team")
     engine = newton_euler.make_engine(config.plant, config.attitude)
-    step = make_control_step(config, engine, autopilot=lambda state, forces, load: (state.loops, forces))
+    step = make_plant_step(config, engine, autopilot=lambda state, forces, load: (state.loops, forces))
     zero, none, mass = np.zeros(3), np.zeros(0), np.float64(config.plant.object_mass)
     load = Load(mass, mass, *np.zeros(3), none, none)
     state = start_state(config, zero, zero, zero, mass, np.zeros(2))
@@ -125,7 +125,7 @@ def test_a_control_step_of_every_world_may_have_another_rig() -> None:
 
     def flown(config, parameters, commands, load, *start, repeat=jax.lax.fori_loop):
         engine = newton_euler.make_engine(config.plant, config.attitude, parameters)
-        step = make_control_step(config, engine, parameters=parameters)
+        step = make_plant_step(config, engine, parameters=parameters)
         return repeat(0, 5, lambda _, state: step(state, commands, load), start_state(config, *start, parameters))
 
     def in_numpy(first, last, step, state):

@@ -16,7 +16,7 @@ from tables import weekly
 from mjxball.errors import InputError
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import controller_of, shipped_policy
+from mjxball.policy.file import interface_of, shipped_policy
 from mjxball.policy.formats import c_header
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror")
@@ -145,7 +145,7 @@ def test_compilers_that_are_told_of_finite_numbers_only_remove_no_guard(int8: bo
     """Of observation, memory and result, in float and double; sums that they reorder hardly differ."""
     policy = load_file(shipped_policy("balance"))
     (tmp_path / "first.h").write_text(c_header.c_header(policy, "first", int8))
-    size, wanted = controller_of(policy.metadata).size, answers(tmp_path, ONE, observations())
+    size, wanted = interface_of(policy.metadata).size, answers(tmp_path, ONE, observations())
     # In each of 20 steps another number of the memory is spoilt, and the flight begins anew with the next one.
     spoil = f"""
         static int n;

@@ -21,7 +21,7 @@ from mjxball import __version__
 from mjxball.cli import plant_setup
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import controller_of, shipped_policy
+from mjxball.policy.file import interface_of, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 from mjxball.policy.quantize import balanced, rows_of
@@ -111,7 +111,7 @@ def flown(contents: PolicyFile, dtype: Any, policy: Policy | None = None) -> Fli
     """NumPy inference, by `policy` or `contents`, on observations that change as smoothly as a flight's."""
     policy, random = policy or Policy(contents, "follower", dtype), np.random.default_rng(3)
     walk = np.cumsum(random.normal(scale=0.03, size=(STEPS, 18)), axis=0) + random.normal(scale=0.3, size=18)
-    size = controller_of(contents.metadata).size
+    size = interface_of(contents.metadata).size
     rows: dict[str, list[Any]] = {field.name: [] for field in dataclasses.fields(Flight)}
     for number, seen in enumerate(walk.astype(np.float32)):
         start = number % (STEPS // 2) == 0
@@ -121,7 +121,7 @@ def flown(contents: PolicyFile, dtype: Any, policy: Policy | None = None) -> Fli
         rows["memory"].append(np.zeros(size) if policy.memory is None else policy.memory)
         rows["observation"].append(seen)
         memory = policy.memory
-        rows["action"].append(policy.scaled(seen))
+        rows["action"].append(policy.action(seen))
         after = policy.memory
         policy.memory = memory
         rows["command"].append(policy(seen))
@@ -239,7 +239,7 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert f"RAM: {cost.state} bytes" in text
     size, widest = map(int, re.search(r"mjxball_follower_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
     gates = re.search(r"given\[(\d+)\], kept\[(\d+)\], next\[(\d+)\], joined\[(\d+)\];", text)
-    assert (gates is None) == (controller_of(contents.metadata).units == 0)
+    assert (gates is None) == (interface_of(contents.metadata).units == 0)
     own = sum(map(int, gates.groups())) if gates else 0
     assert 4 * (size + 2 * widest + own) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text

@@ -14,7 +14,7 @@ from tables import rows
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import controller_of, shipped_policy
+from mjxball.policy.file import interface_of, shipped_policy
 from mjxball.policy.formats.onnx_model import onnx_model
 
 # Without a memory, with averages of what was seen, with a GRU, and with one that is told its team.
@@ -31,7 +31,7 @@ class Model:
     """Flights of a batch on an ONNX model, which is fed its own memory; `start` until a row is valid."""
 
     def __init__(self, contents: PolicyFile):
-        self.size = controller_of(contents.metadata).size
+        self.size = interface_of(contents.metadata).size
         self.session = onnxruntime.InferenceSession(onnx_model(contents, "follower").SerializeToString())
         self.names = [item.name for item in self.session.get_outputs()]
 

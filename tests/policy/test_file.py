@@ -15,7 +15,7 @@ from conftest import Trained, policy_of
 from mjxball.control import observation as layout
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.export import policy_file
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 from mjxball.train.extensions import DEFAULTS, make_env
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
@@ -87,14 +87,14 @@ class TestInference:
         still = dataclasses.replace(
             contents, weights=tuple(np.zeros_like(weight) for weight in contents.weights), biases=tuple(biases)
         )
-        found = Policy(still, "still", np.float64).scaled(OBSERVATIONS)
+        found = Policy(still, "still", np.float64).action(OBSERVATIONS)
         np.testing.assert_allclose(found, np.tile(np.tanh([0.1, -0.2, 0.3]), (40, 1)), rtol=1e-7)  # float32 biases
 
     def test_float32_agrees_with_flax(self, trained, saved):
         seen = np.asarray(3 * OBSERVATIONS, np.float32)
         with jax.default_matmul_precision("highest"):
             expected = flax_mean(trained, trained.learner, jnp.asarray(seen))
-        found = Policy.load(saved).scaled(seen)
+        found = Policy.load(saved).action(seen)
         assert found.dtype == np.float32
         assert np.ptp(found) > 0.1  # the actions differ from world to world
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)  # docs/policy-file.md
@@ -111,7 +111,7 @@ class TestInference:
             )
             learner = trained.learner._replace(average=wide, normaliser=normaliser)
             expected = np.asarray(flax_mean(trained, learner, jnp.asarray(OBSERVATIONS)))
-        found = Policy(contents, "wide", np.float64).scaled(OBSERVATIONS)
+        found = Policy(contents, "wide", np.float64).action(OBSERVATIONS)
         assert found.dtype == expected.dtype == np.float64
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)  # docs/policy-file.md
 
@@ -125,14 +125,14 @@ class TestInference:
         limit = np.array([limits.tilt_limit, limits.tilt_limit, limits.vertical_limit])
         wanted = np.array(leader.kp) * seen[:, 12:15] + np.array(leader.kd) * seen[:, 15:18]
         copied = np.stack([-wanted[:, 1] / gravity, wanted[:, 0] / gravity, wanted[:, 2]], axis=1)
-        expected = np.clip(np.clip(copied, -limit, limit) + policy.scaled(seen) * reach, -limit, limit)
+        expected = np.clip(np.clip(copied, -limit, limit) + policy.action(seen) * reach, -limit, limit)
         np.testing.assert_allclose(policy(seen), expected, rtol=0, atol=1e-5)  # float32 of up to 6 m/s2
 
     def test_ignored_position_does_not_matter(self, trained, saved):
         policy = Policy.load(saved)
         moved = OBSERVATIONS.copy()
         moved[:, :3] += 100.0
-        np.testing.assert_array_equal(policy.scaled(moved), policy.scaled(OBSERVATIONS))
+        np.testing.assert_array_equal(policy.action(moved), policy.action(OBSERVATIONS))
 
     def test_batch_equals_single(self, saved):
         policy = Policy.load(saved)
@@ -154,25 +154,25 @@ class TestInference:
             for _ in range(6):
                 with jax.default_matmul_precision("highest"):
                     expected = flax_mean(remembering, remembering.learner, state.obs)
-                found = policy.scaled(np.asarray(state.obs[: layout.OBSERVATION_SIZE]))
+                found = policy.action(np.asarray(state.obs[: layout.OBSERVATION_SIZE]))
                 # 1e-5 for the network (docs/policy-file.md); its own rounding returns through the last action.
                 np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
                 state = remembering_pair.step(state, jnp.asarray(expected))
 
     def test_memory_matters_and_reset_forgets_it(self, remembering):
         policy = Policy(remembering.contents, "remembering")
-        first = policy.scaled(OBSERVATIONS[0])
-        policy.scaled(OBSERVATIONS[1])
-        later = policy.scaled(OBSERVATIONS[0])
+        first = policy.action(OBSERVATIONS[0])
+        policy.action(OBSERVATIONS[1])
+        later = policy.action(OBSERVATIONS[0])
         policy.reset()
-        np.testing.assert_array_equal(policy.scaled(OBSERVATIONS[0]), first)
+        np.testing.assert_array_equal(policy.action(OBSERVATIONS[0]), first)
         assert (later != first).any()
 
     def test_memory_of_a_batch_is_the_memory_of_each(self, remembering):
         batch = Policy(remembering.contents, "batch")
         single = Policy(remembering.contents, "single")
-        together = np.stack([batch.scaled(OBSERVATIONS[k : k + 4]) for k in range(5)])
-        alone = np.stack([single.scaled(OBSERVATIONS[k + 2]) for k in range(5)])
+        together = np.stack([batch.action(OBSERVATIONS[k : k + 4]) for k in range(5)])
+        alone = np.stack([single.action(OBSERVATIONS[k + 2]) for k in range(5)])
         np.testing.assert_allclose(together[:, 2], alone, rtol=0, atol=1e-5)  # float32, other order of sums
 
 
@@ -186,7 +186,7 @@ def test_export_takes_the_averaged_policy(trained):
     learner = trained.learner._replace(policy=jax.tree.map(jnp.zeros_like, trained.learner.policy))
     contents = policy_file(
         trained.config,
-        follower_controller(trained.config),
+        network_interface(trained.config),
         policy_of(make_env(DEFAULTS, trained.config, "newton-euler"), learner),
         steps=1,
     )

@@ -13,12 +13,12 @@ from mjxball.baselines import CONTROLLERS as FOLLOWERS
 from mjxball.baselines import make_controller
 from mjxball.config import Autopilot, preset
 from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
-from mjxball.control.follower_controller import FollowerController
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.geometry import ring_geometry
+from mjxball.control.network_interface import NetworkInterface
 from mjxball.control.observation import ObservationHistory
 from mjxball.plant import AttitudeGains
-from mjxball.sim.follower import follower_controller
+from mjxball.sim.follower import network_interface
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -38,7 +38,7 @@ KP, KD, KI = (0.5, 0.4, 0.3), (1.0, 0.9, 0.8), (0.1, 0.0, 0.2)
 GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
 MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
-RECURRENT = follower_controller(preset("team"))
+RECURRENT = network_interface(preset("team"))
 GIVEN, STATE = random.uniform(1, 3, (WORLDS, 4)), random.uniform(-1, 1, (WORLDS, RECURRENT.units))
 KEPT = 0.1 * normal(RECURRENT.size)
 HISTORY = ObservationHistory(previous_action=True, filters=(0.1, 0.5))
@@ -124,13 +124,13 @@ CONTROLLERS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "history.next": (HISTORY.next, (MEMORY, SEEN, ACTION)),
     "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
     "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
-    "follower_controller.command": (
-        lambda a, s: FollowerController(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s),
+    "network_interface.command": (
+        lambda a, s: NetworkInterface(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s),
         (ACTION, 3 * SEEN),
     ),
-    "follower_controller.start": (RECURRENT.start, (SEEN, GIVEN)),
-    "follower_controller.next": (RECURRENT.next, (KEPT, SEEN, np.concatenate([ACTION, STATE], axis=-1))),
-    "follower_controller.network_input": (RECURRENT.network_input, (SEEN, KEPT)),
+    "network_interface.start": (RECURRENT.start, (SEEN, GIVEN)),
+    "network_interface.next": (RECURRENT.next, (KEPT, SEEN, np.concatenate([ACTION, STATE], axis=-1))),
+    "network_interface.network_input": (RECURRENT.network_input, (SEEN, KEPT)),
     "geometry.ring_geometry": (ring_geometry, (np.arange(WORLDS) % 5 + 2.0, normal(2))),
     **{f"baseline {name}": (flown(name), (CALM.get(name, FLIGHT), *PRIVILEGED)) for name in FOLLOWERS},
     **{
@@ -144,7 +144,7 @@ NOT_CONTROLLERS = {
     "crazyflie.unpack",
     "crazyflie.cascade",
     "crazyflie.integral_shares",
-    "observation.commanded",
+    "observation.action_mask",
     "observation.mount_angles",
     "observation.mount_frames",
     "observation.observation_history",

@@ -14,7 +14,7 @@ from conftest import CompiledEnv, compile_env, with_settings
 from mjxball.config import Config, preset, replace
 from mjxball.env import TransportEnv
 from mjxball.physics import motion, newton_euler
-from mjxball.physics.step import jax_repeat, make_control_step
+from mjxball.physics.step import jax_repeat, make_plant_step
 from mjxball.sim.disturbances import GUST_TIME, NOISE, RandomDisturbances
 
 SEEN = jnp.arange(18.0)
@@ -107,7 +107,7 @@ def test_rotors_of_a_world_are_those_of_a_plant_with_such_rotors(transport: Conf
     other = replace(transport, "plant.rotor_lag", 2.0 * transport.plant.rotor_lag)
 
     def stepped(config: Config, load: Any) -> Any:
-        step = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
+        step = make_plant_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
         return step(world.plant, commands, load)
 
     scaled = stepped(transport, world.load._replace(rotor_lag_scale=jnp.array(2.0)))

@@ -20,7 +20,7 @@ from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics.newton_euler import make_engine
-from mjxball.physics.step import make_control_step
+from mjxball.physics.step import make_plant_step
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
@@ -164,7 +164,7 @@ def test_training_differentiates_what_followers_remember() -> None:
 
 def test_thrust_falls_as_the_battery_empties() -> None:
     config = preset("paper")
-    step = make_control_step(config, make_engine(config.plant, config.attitude))
+    step = make_plant_step(config, make_engine(config.plant, config.attitude))
     scenario = [Scenario(seconds=1.0)]
     load, state = load_of(config, scenario), start_of(config, scenario)
     for fade in (0.0, 0.1):

@@ -103,7 +103,7 @@ def test_a_program_that_was_traced_before_trains_alike(tmp_path: Path, monkeypat
         population = Population(config, "newton-euler", extensions=Extensions(None, None, FirstOrderGradient))
         compiled = population.compile(creating=True)
         state = population.start(compiled, 0)
-        for mode in (programs.warmup(2), programs.train(4)):
+        for mode in (programs.warmup_mode(2), programs.train_mode(4)):
             state, statistics, *_ = population.advance(compiled, state, mode)
         rewards.append(float(statistics.reward))
         assert int(state.steps) == 12

@@ -91,8 +91,9 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
     tiny = with_settings(small, sac={**SMALL, "total_steps": 800})
     population = Population(tiny, "newton-euler", extensions=Extensions(toys.DoubleIntegrator))
     program, compiled = population.program, population.compile(creating=True)
-    state, *_ = population.advance(compiled, population.start(compiled, 5), programs.warmup(program.warmup_rounds))
-    state, *_ = population.advance(compiled, state, programs.train(program.total_rounds - program.warmup_rounds))
+    warmup, total = program.warmup_steps_each, program.total_steps_each
+    state, *_ = population.advance(compiled, population.start(compiled, 5), programs.warmup_mode(warmup))
+    state, *_ = population.advance(compiled, state, programs.train_mode(total - warmup))
     policy, _ = jax.jit(lambda key: train(tiny, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(5))
     for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(population.policy(state, 0)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # two programs: XLA may fuse them differently
@@ -106,7 +107,7 @@ def test_an_episode_that_ends_early_has_its_own_return(name: str, small: Config)
     state = jax.jit(program.create)(jax.random.PRNGKey(0))
     state = state._replace(envs=program.evaluation_envs(jax.random.PRNGKey(0)))
     steps = program.evaluation_steps
-    _, statistics, _ = jax.jit(program.advance)(state, programs.evaluate(steps))
+    _, statistics, _ = jax.jit(program.advance)(state, programs.evaluate_mode(steps))
     assert float(statistics.reward) == steps == 60
     # 60 steps are 8 whole episodes and the begin of a ninth.
     assert float(program.evaluated_return(statistics.reward, statistics.ended)) == pytest.approx(60 / 9)

@@ -55,10 +55,10 @@ def together(small: Config) -> tuple[Population, Any, Any]:
     """Two members, and what they are after 5 and 20 steps of training, on what compiles soonest."""
     population = Population(small, "newton-euler", 2, extensions=POINT)
     compiled = population.compile(creating=True)
-    state, *_ = population.advance(compiled, population.start(compiled, 5), programs.warmup(10))
-    state, *_ = population.advance(compiled, state, programs.train(5))
+    state, *_ = population.advance(compiled, population.start(compiled, 5), programs.warmup_mode(10))
+    state, *_ = population.advance(compiled, state, programs.train_mode(5))
     early = jax.tree.map(np.array, state)  # its memory is given away
-    return population, early, population.advance(compiled, state, programs.train(15))[0]
+    return population, early, population.advance(compiled, state, programs.train_mode(15))[0]
 
 
 @pytest.mark.slow
@@ -67,8 +67,8 @@ def test_members_are_the_runs_of_their_seeds(small: Config, together: tuple[Popu
     single = Population(small, "newton-euler", extensions=POINT)
     compiled = single.compile(creating=True)
     for member in range(2):
-        state, *_ = single.advance(compiled, single.start(compiled, 5 + member), programs.warmup(10))
-        alone, *_ = single.advance(compiled, state, programs.train(20))
+        state, *_ = single.advance(compiled, single.start(compiled, 5 + member), programs.warmup_mode(10))
+        alone, *_ = single.advance(compiled, state, programs.train_mode(20))
         mine = population.member(late, member)
         for a, b in zip(
             jax.tree.leaves(mine.algorithm.learner.policy), jax.tree.leaves(alone.algorithm.learner.policy), strict=True
@@ -86,9 +86,9 @@ def test_training_that_pauses_goes_on_bit_for_bit(together: tuple[Population, An
         asked.append(1)
         return len(asked) == 4
 
-    state, _, _, taken = population.advance(compiled, early, programs.train(15), pause)
+    state, _, _, taken = population.advance(compiled, early, programs.train_mode(15), pause)
     assert taken == len(asked) == 4
-    state, _, _, taken = population.advance(compiled, state, programs.train(11), lambda: False)
+    state, _, _, taken = population.advance(compiled, state, programs.train_mode(11), lambda: False)
     assert taken == 11
     jax.tree.map(np.testing.assert_array_equal, state, late)
 
@@ -106,8 +106,8 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
         before = np.asarray(jax.tree.leaves(state.algorithm.learner.policy)[-1])
-        state, *_ = population.advance(compiled, state, programs.warmup(10))
-        state, *_ = population.advance(compiled, state, programs.train(20))
+        state, *_ = population.advance(compiled, state, programs.warmup_mode(10))
+        state, *_ = population.advance(compiled, state, programs.train_mode(20))
         moved.append(np.abs(np.asarray(jax.tree.leaves(state.algorithm.learner.policy)[-1]) - before).max(axis=(1, 2)))
     # No traced program says which files of Python made it: XLA would print them all.
     assert not any(b".py" in path.read_bytes() for path in tmp_path.iterdir())
@@ -197,8 +197,8 @@ point = Extensions(toys.DoubleIntegrator)
 population = Population(config, "newton-euler", 2, extensions=point)
 assert population.devices == jax.local_device_count() == 2
 compiled = population.compile(creating=True)
-state, *_ = population.advance(compiled, population.start(compiled, 5), P.warmup(10))
-state, *_ = population.advance(compiled, state, P.train(5))
+state, *_ = population.advance(compiled, population.start(compiled, 5), P.warmup_mode(10))
+state, *_ = population.advance(compiled, state, P.train_mode(5))
 leaves = jax.tree.leaves(state.algorithm.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
 assert Population(config, "newton-euler", 2, devices=jax.local_devices()[:1], extensions=point).devices == 1

@@ -44,7 +44,7 @@ def compiled(transport) -> Compiled:
 @pytest.fixture(scope="module")
 def prefilled(compiled) -> TrainState:
     """A state with enough transitions to learn from."""
-    return compiled.advance(compiled.create(jax.random.key(0)), programs.warmup(20))[0]
+    return compiled.advance(compiled.create(jax.random.key(0)), programs.warmup_mode(20))[0]
 
 
 def raw(tree: Any) -> Any:
@@ -79,7 +79,7 @@ def recorded(state: TrainState) -> np.ndarray:
 def evaluated_return(compiled: Compiled, state: TrainState, steps: int = 500) -> float:
     """Mean reward per step on the same fresh worlds every time."""
     worlds = compiled.fresh(jax.random.key(99))
-    _, statistics, *_ = compiled.advance(state._replace(envs=worlds), programs.evaluate(steps))
+    _, statistics, *_ = compiled.advance(state._replace(envs=worlds), programs.evaluate_mode(steps))
     assert int(statistics.totals["diverged"]) == 0
     return float(statistics.reward) / steps
 
@@ -101,7 +101,7 @@ def test_normaliser_holds_the_statistics_of_what_was_seen(compiled, prefilled):
 
 
 def test_training_counts_its_updates_and_changes_the_policy(compiled, prefilled):
-    after, *_ = compiled.advance(prefilled, programs.train(3))
+    after, *_ = compiled.advance(prefilled, programs.train_mode(3))
     assert int(after.steps - prefilled.steps) == 3 * WORLDS
     moved = jax.tree.map(
         lambda a, b: float(jnp.abs(a - b).max()), after.algorithm.learner.policy, prefilled.algorithm.learner.policy
@@ -111,15 +111,15 @@ def test_training_counts_its_updates_and_changes_the_policy(compiled, prefilled)
 
 def test_two_calls_equal_one_bit_for_bit(compiled, prefilled):
     """A resumed run is the run."""
-    whole, *_ = compiled.advance(prefilled, programs.train(5))
-    half, *_ = compiled.advance(prefilled, programs.train(2))
-    both, *_ = compiled.advance(half, programs.train(3))
+    whole, *_ = compiled.advance(prefilled, programs.train_mode(5))
+    half, *_ = compiled.advance(prefilled, programs.train_mode(2))
+    both, *_ = compiled.advance(half, programs.train_mode(3))
     assert_identical(both, whole)
 
 
 def test_evaluation_leaves_learner_and_replay_untouched(compiled, prefilled):
-    trained, *_ = compiled.advance(prefilled, programs.train(2))
-    after, *_ = compiled.advance(trained, programs.evaluate(30))
+    trained, *_ = compiled.advance(prefilled, programs.train_mode(2))
+    after, *_ = compiled.advance(trained, programs.evaluate_mode(30))
     assert_identical(after.algorithm.learner, trained.algorithm.learner)
     np.testing.assert_array_equal(recorded(after), recorded(trained))
     assert int(after.algorithm.replay.inserted) == int(trained.algorithm.replay.inserted)
@@ -144,8 +144,8 @@ def test_evaluation_flies_the_averaged_policy(compiled, prefilled):
 
 def run(state: TrainState, advance: Any) -> TrainState:
     """Ten random steps and two of training."""
-    state, *_ = advance(state, programs.warmup(10))
-    return advance(state, programs.train(2))[0]
+    state, *_ = advance(state, programs.warmup_mode(10))
+    return advance(state, programs.train_mode(2))[0]
 
 
 def test_same_seed_same_run_and_another_seed_another(compiled):
@@ -168,7 +168,7 @@ def end_all_worlds(compiled: Compiled, prefilled: TrainState, **parts: Any) -> E
     """Step all worlds once after replacing `parts` of them, and read the newest rows."""
     worlds = prefilled.envs
     ending = worlds.replace(pipeline_state=worlds.pipeline_state._replace(**parts))
-    after, statistics, *_ = compiled.advance(prefilled._replace(envs=ending), programs.warmup(1))
+    after, statistics, *_ = compiled.advance(prefilled._replace(envs=ending), programs.warmup_mode(1))
     newest = recorded(after)[20 * WORLDS : 21 * WORLDS]
     seen = compiled.program.environments.observation_size
     np.testing.assert_array_equal(after.envs.pipeline_state.steps, 0)  # all start anew
@@ -199,9 +199,9 @@ def test_time_limits_are_bootstrapped(compiled, prefilled):
 
 
 def test_short_training_improves_the_evaluation(compiled):
-    state, *_ = compiled.advance(compiled.create(jax.random.key(0)), programs.warmup(100))
+    state, *_ = compiled.advance(compiled.create(jax.random.key(0)), programs.warmup_mode(100))
     before = evaluated_return(compiled, state)
-    state, _, metrics = compiled.advance(state, programs.train(900))
+    state, _, metrics = compiled.advance(state, programs.train_mode(900))
     after = evaluated_return(compiled, state)
     assert np.isfinite(list(metrics.values())).all()
     # Seen: -20 before and -2 after. A quarter is far beyond the noise of 128 worlds and far from what fails.

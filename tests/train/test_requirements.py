@@ -86,7 +86,7 @@ def test_the_estimate_of_gradients_is_below_what_xla_takes() -> None:
         settings, "newton-euler", extensions=Extensions(algorithm=find("gradient", "--algorithm"))
     )
     state = jax.eval_shape(program.create, jax.random.PRNGKey(0))
-    compiled = jax.jit(program.advance).lower(state, programs.train(20)).compile()
+    compiled = jax.jit(program.advance).lower(state, programs.train_mode(20)).compile()
     taken = compiled.memory_analysis()
     assert required(settings, "gradient", 1).memory < taken.temp_size_in_bytes + 2 * taken.argument_size_in_bytes
 

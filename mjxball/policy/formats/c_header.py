@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from mjxball import __version__
-from mjxball.control.follower_controller import NEAR_ERROR, NEAR_ERROR_RATE, FollowerController
 from mjxball.control.followers import MAX_OBSERVATION
 from mjxball.control.geometry import GEOMETRY_SIZE
+from mjxball.control.network_interface import NEAR_ERROR, NEAR_ERROR_RATE, NetworkInterface
 from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, controller_of
+from mjxball.policy.file import PolicyFile, interface_of
 from mjxball.policy.formats import c_texts
 from mjxball.policy.inference import known_geometry
 from mjxball.policy.quantize import Rows, balanced, rows_of
@@ -38,13 +38,13 @@ class Footprint:
 
 def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     """Memory that the header of `policy` needs on board, see `c_header`."""
-    (weights, biases), controller = layers_of(policy), controller_of(policy.metadata)
-    size, units = len(policy.observation_mean), controller.units
+    (weights, biases), interface = layers_of(policy), interface_of(policy.metadata)
+    size, units = len(policy.observation_mean), interface.units
     outputs = [weight.shape[1] for weight in weights]
     widest = max(outputs[2 if units else 0 :])
-    constants = 2 * ACTION_SIZE + GEOMETRY_SIZE * controller.geometry
+    constants = 2 * ACTION_SIZE + GEOMETRY_SIZE * interface.geometry
     recurrent = 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and the ends of both `hidden`
-    state, stack = FLOAT * controller.size + 4, FLOAT * (size + 2 * widest + recurrent)
+    state, stack = FLOAT * interface.size + 4, FLOAT * (size + 2 * widest + recurrent)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
         return Footprint(flash, state + FLOAT, stack + 2 * (_most_inputs(weights) + 7))
@@ -68,10 +68,10 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     follower in its metadata field `team`. InputError without that field, or for layers too wide for `int8`.
     """
     geometry = known_geometry(policy.metadata, name)
-    controller, metadata, cost = controller_of(policy.metadata), policy.metadata, footprint(policy, int8)
-    history = controller.history
+    interface, metadata, cost = interface_of(policy.metadata), policy.metadata, footprint(policy, int8)
+    history = interface.history
     weights, _ = layers_of(policy)
-    outputs = [weight.shape[1] for weight in weights[2 if controller.units else 0 :]]
+    outputs = [weight.shape[1] for weight in weights[2 if interface.units else 0 :]]
     size, most = len(policy.observation_mean), _most_inputs(weights)
     if int8 and most > WIDEST_INT8:
         raise InputError(f"{name} has a layer of {most} inputs; with weights of 8 bits {WIDEST_INT8} at most")
@@ -80,7 +80,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
     arrays += [] if geometry is None else [_array("geometry", geometry)]
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
-    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.GRU if controller.units else "")
+    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.GRU if interface.units else "")
     text = c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(
@@ -91,12 +91,12 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         period=f"{metadata['control_period']:g}",
         gravity=_literal(metadata["gravity"]),
         observation=_table(),
-        layers=" x ".join(map(str, [size, *([f"GRU {controller.units}"] if controller.units else []), *outputs])),
+        layers=" x ".join(map(str, [size, *([f"GRU {interface.units}"] if interface.units else []), *outputs])),
         flash=cost.flash,
         state=cost.state,
         stack=cost.stack,
         size=size,
-        widest=max(outputs) + controller.units,
+        widest=max(outputs) + interface.units,
         most_inputs=most,
         largest=_literal(MAX_OBSERVATION),
         int8="#define MJXBALL_INT8 1\n" if int8 else "",
@@ -106,19 +106,19 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         weights_type=_weights_type(policy) if int8 else "",
         compiled=_compiled(policy) if int8 else "",
         leader="\n".join(["    int i;", *_leader(metadata, "to")]),
-        memory_size=controller.size,
-        memory_field=f"    mjxball_real memory[{controller.size}];\n" if controller.size else "",
+        memory_size=interface.size,
+        memory_field=f"    mjxball_real memory[{interface.size}];\n" if interface.size else "",
         helpers=helpers,
         team="" if geometry is None else _team(metadata["team"]),
         mount_angle=""
         if geometry is None
         else f"#define MJXBALL_MOUNT_ANGLE {_literal(metadata['team']['mount_angle'])}\n",
-        memory_pointer="    mjxball_real *memory = follower->memory;\n" if controller.size else "",
+        memory_pointer="    mjxball_real *memory = follower->memory;\n" if interface.size else "",
         arrays="\n".join(arrays),
-        history=_history(controller),
-        history_update=_history_update(controller),
-        network=_network(controller, policy, int8),
-        command=_command(controller),
+        history=_history(interface),
+        history_update=_history_update(interface),
+        network=_network(interface, policy, int8),
+        command=_command(interface),
     )
     return _named(text, prefix or prefix_of(name))
 
@@ -192,57 +192,57 @@ def _table() -> str:
     return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
 
 
-def _history(controller: FollowerController) -> str:
-    """C lines that compute the network's input from observation and memory (`FollowerController`)."""
-    history = controller.history
-    if not controller.size:
+def _history(interface: NetworkInterface) -> str:
+    """C lines that compute the network's input from observation and memory (`NetworkInterface`)."""
+    history = interface.history
+    if not interface.size:
         return "    (void)follower;"
     width = OBSERVATION_SIZE + ACTION_SIZE
     lines = ["    if (!follower->running) {"]
-    lines += [f"        for (i = 0; i < {controller.size}; i++) memory[i] = 0;"]
+    lines += [f"        for (i = 0; i < {interface.size}; i++) memory[i] = 0;"]
     for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {k * width}, observation, {OBSERVATION_SIZE});"]
-    if controller.geometry:
-        stored = f"memory[{history.size + controller.units} + i]"
+    if interface.geometry:
+        stored = f"memory[{history.size + interface.units} + i]"
         lines += [f"        for (i = 0; i < {GEOMETRY_SIZE}; i++) {stored} = mjxball_geometry[i];"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
         offset = OBSERVATION_SIZE + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{offset} + i] -= observation[i];"]
-    if controller.units:
-        lines += _saturated(controller, OBSERVATION_SIZE + history.size)
+    if interface.units:
+        lines += _saturated(interface, OBSERVATION_SIZE + history.size)
     return "\n".join(lines)
 
 
-def _saturated(controller: FollowerController, offset: int) -> list[str]:
+def _saturated(interface: NetworkInterface, offset: int) -> list[str]:
     """C lines that compute the additional inputs of a recurrent network, from index `offset` of `input` on."""
     lines = []
     for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE)):
         scaled = f"observation[{part.start} + i] * (mjxball_real){1 / scale!r}"
         lines += [f"    for (i = 0; i < 3; i++) input[{offset} + i] = mjxball_tanh({scaled});"]
         offset += 3
-    if controller.geometry:
-        known = controller.history.size + controller.units
+    if interface.geometry:
+        known = interface.history.size + interface.units
         lines += [f"    mjxball_copy(input + {offset}, memory + {known}, {GEOMETRY_SIZE});"]
     return lines
 
 
-def _history_update(controller: FollowerController) -> str:
+def _history_update(interface: NetworkInterface) -> str:
     """C lines that advance the memory by one step."""
-    lines, history, width = [], controller.history, OBSERVATION_SIZE + ACTION_SIZE
+    lines, history, width = [], interface.history, OBSERVATION_SIZE + ACTION_SIZE
     for k, tau in enumerate(history.filters):
         offset, share = k * width, _literal(-math.expm1(-history.period / tau))
         lines += [f"    mjxball_approach(memory + {offset}, observation, {OBSERVATION_SIZE}, {share});"]
         lines += [f"    mjxball_approach(memory + {offset + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
-    if controller.units:
-        lines += [f"    mjxball_copy(memory + {history.size}, next, {controller.units});"]
+    if interface.units:
+        lines += [f"    mjxball_copy(memory + {history.size}, next, {interface.units});"]
     return "\n".join(lines)
 
 
-def _network(controller: FollowerController, policy: PolicyFile, int8: bool) -> str:
+def _network(interface: NetworkInterface, policy: PolicyFile, int8: bool) -> str:
     """C lines that normalise `input` and call the layers."""
     size, own = len(policy.observation_mean), "w->" if int8 else "mjxball_"
     weights, biases = layers_of(policy)
@@ -256,9 +256,9 @@ def _network(controller: FollowerController, policy: PolicyFile, int8: bool) -> 
         steps, row = (f"w->step_{n}, ", f", {stride(inputs)}") if int8 else ("", "")
         added = f"{own}bias_{n}" if bias.size else "0"
         calls += [f"mjxball_layer({own}weight_{n}, {steps}{added}, {inputs}, {outputs}{row}"]
-    if not controller.units:
+    if not interface.units:
         return "\n".join([*lines, *_layers(shapes, calls, "input")])
-    units, state = controller.units, f"memory + {controller.history.size}"
+    units, state = interface.units, f"memory + {interface.history.size}"
     lines += [f"    mjxball_real given[{3 * units}], kept[{3 * units}], next[{units}], joined[{size + 2 * units}];"]
     lines += [_called(f"{calls[0]}, input, given)"), _called(f"{calls[1]}, {state}, kept)")]
     lines += [f"    mjxball_gru(given, kept, {state}, {units}, next);"]
@@ -372,12 +372,12 @@ def _leader(metadata: dict[str, Any], to: str) -> list[str]:
     ]
 
 
-def _command(controller: FollowerController) -> str:
+def _command(interface: NetworkInterface) -> str:
     """C lines that compute the command from `action`, which is added to the PD command unless the mode is direct."""
     base = "mjxball_copy_law(observation, command);"
     return "\n".join(
         [
-            f"    {base if controller.residual else 'for (i = 0; i < 3; i++) command[i] = 0;'}",
+            f"    {base if interface.residual else 'for (i = 0; i < 3; i++) command[i] = 0;'}",
             "    for (i = 0; i < 3; i++)",
             "        command[i] = mjxball_clip(command[i] + mjxball_action_scale[i] * action[i], mjxball_limit[i]);",
         ]

@@ -18,7 +18,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 from mjxball import __version__
 from mjxball.control import observation as layout
 from mjxball.control.followers import MAX_OBSERVATION
-from mjxball.policy.file import PolicyFile, controller_of
+from mjxball.policy.file import PolicyFile, interface_of
 from mjxball.policy.inference import NetworkController, Policy, known_geometry
 
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
@@ -159,7 +159,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     A policy that needs the geometry of its team is exported for one follower, named by `team` in its metadata. That
     follower observes and commands in its mount frame.
     """
-    graph, around = Graph(), controller_of(contents.metadata)
+    graph, around = Graph(), interface_of(contents.metadata)
     controller = NetworkController(Policy(contents, "traced", np.float32))
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]

@@ -13,7 +13,7 @@ import pytest
 from onboard_bench import AT_REST, Bench, compilers, cores_by, cores_of, needs_gcc, policy_of
 from tables import rows
 
-from mjxball.policy.file import controller_of
+from mjxball.policy.file import interface_of
 from mjxfly.app.host import App
 from mjxfly.app.protocol import CAUSES, AppPhase
 from mjxfly.policy_setup import config_of, variants
@@ -209,7 +209,7 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
 @rows("name", ["recurrent flight", "universal"])
 def test_a_state_of_the_network_that_is_not_finite_lands_the_pair(name: str):
     """The controller of `copy` flies on from the same period; what cannot be is forgotten."""
-    size = controller_of(policy_of(name).metadata).size
+    size = interface_of(policy_of(name).metadata).size
     for value in (math.nan, math.inf, -math.inf):
         bench = flying(name)
         app = bench.apps[1]

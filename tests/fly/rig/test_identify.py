@@ -18,7 +18,7 @@ from mjxball.control import crazyflie, rotations
 from mjxball.control.axes import inertia_about_o
 from mjxball.errors import InputError
 from mjxball.physics.engine import Load
-from mjxball.physics.step import make_stepper, start_state
+from mjxball.physics.step import make_numpy_plant_step, start_state
 from mjxball.plant import plant_parameters
 from mjxfly.preflight import read_gains
 from mjxfly.rig import identify as command
@@ -53,7 +53,7 @@ def record(config: Config, rig: Rig, seconds: float, noise: float = 1.0) -> dict
         thrust_scale=rig.thrust * np.ones((1, 2)),
         added_inertia=np.array([[rig.added, 0, 0]]),
     )
-    step, zero = make_stepper(config, "newton-euler"), np.zeros((1, 3))
+    step, zero = make_numpy_plant_step(config, "newton-euler"), np.zeros((1, 3))
     state = start_state(config, zero, zero, zero, mass * one, np.zeros(1))
     constants = plant_parameters(config.plant, config.attitude)
     commands: list[np.ndarray] = []

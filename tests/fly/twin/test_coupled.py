@@ -13,7 +13,7 @@ from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import make_control_step, start_state
+from mjxball.physics.step import make_plant_step, start_state
 from mjxball.plant import plant_parameters
 from mjxfly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
 from mjxfly.twin.coupled import CoupledPair
@@ -66,7 +66,7 @@ def test_a_second_in_the_air_is_that_of_the_closed_form(preset: str) -> None:
     pair.place(state)
     values = map(np.float64, (mass, mass, 0.03, 1.0, 0.0))
     load = Load(*values, np.zeros(0), np.zeros(0))
-    step = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude))
+    step = make_plant_step(config, newton_euler.make_engine(config.plant, config.attitude))
     constants = plant_parameters(config.plant, config.attitude)
     command = np.array([[0.06, -0.05, 0.3], [0.02, 0.03, -0.2]])
     carried = constants.drone_mass + constants.load_share * mass

@@ -26,7 +26,7 @@ NEAR_ERROR, NEAR_ERROR_RATE = 0.03, 0.1  # [m], [m/s]
 SATURATED = 6  # such numbers
 
 
-class FollowerController(NamedTuple):
+class NetworkInterface(NamedTuple):
     """What is around the network of one follower.
 
     Its memory (..., m) holds that of `history`, the state of the network's GRU, and its team's geometry.
@@ -88,20 +88,20 @@ class FollowerController(NamedTuple):
         """State (..., H) of the network's GRU in `memory` (..., m)."""
         return memory[..., self.history.size : self.history.size + self.units]
 
-    def command(self, scaled: Array, observation: Array) -> Array:
-        """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18).
+    def command(self, action: Array, observation: Array) -> Array:
+        """Command (..., 3) of a network action `action` in [-1, 1] (..., 3) at `observation` (..., 18).
 
-        Here and below `scaled` has the GRU's next state behind it, (..., 3 + H), if there is one.
+        Here and below `action` has the GRU's next state behind it, (..., 3 + H), if there is one.
         """
-        command = scale_action(scaled[..., :ACTION_SIZE], *self.action_scale)
+        command = scale_action(action[..., :ACTION_SIZE], *self.action_scale)
         if self.residual:
             command = command + copy_command(observation, self.kp, self.kd, self.gravity, *self.limits)
         return leader.clip_command(command, *self.limits)
 
-    def next(self, memory: Array, observation: Array, scaled: Array) -> Array:
-        """Memory for the next step, after `observation` was answered by `scaled`."""
-        remembered = self.history.next(memory[..., : self.history.size], observation, scaled[..., :ACTION_SIZE])
+    def next(self, memory: Array, observation: Array, action: Array) -> Array:
+        """Memory for the next step, after `observation` was answered by `action`."""
+        remembered = self.history.next(memory[..., : self.history.size], observation, action[..., :ACTION_SIZE])
         if not self.units:
             return remembered
         known = memory[..., self.history.size + self.units :]
-        return observation.__array_namespace__().concat([remembered, scaled[..., ACTION_SIZE:], known], axis=-1)
+        return observation.__array_namespace__().concat([remembered, action[..., ACTION_SIZE:], known], axis=-1)
