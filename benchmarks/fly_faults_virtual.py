@@ -30,9 +30,10 @@ from mjxball.cli import run_command
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
 from mjxfly.app.host import Library, compile_pair
+from mjxfly.controller import FlightController
 from mjxfly.figures import SETTLING
 from mjxfly.limits import FlightSettings
-from mjxfly.policy_setup import FlightController, goal_of, limits_of, times_of
+from mjxfly.policy_setup import goal_of, limits_of, times_of
 from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
 from virtual_twin import MemoryLog, TrueState, VirtualTwin

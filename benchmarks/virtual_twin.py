@@ -20,11 +20,12 @@ from mjxball.policy import Policy
 from mjxfly import app_flight, packets, positioning
 from mjxfly.app.host import Library
 from mjxfly.app.protocol import APP_VARIABLES, sample_of
+from mjxfly.controller import FlightController
 from mjxfly.flight import Flight
 from mjxfly.limits import NAMES, FlightSettings
 from mjxfly.monitor import down_reason
 from mjxfly.packets import Packet
-from mjxfly.policy_setup import FlightController, motor_of, times_of, variants
+from mjxfly.policy_setup import motor_of, times_of, variants
 from mjxfly.preflight import parameters_of
 from mjxfly.setpoints import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxfly.supervisor import FlightState, Supervisor

@@ -11,6 +11,7 @@ import numpy as np
 
 from mjxball.control import rotations
 from mjxfly import packets, probe, setpoints
+from mjxfly.controller import FlightController, PairCommands
 from mjxfly.display import View
 from mjxfly.ending import Ending
 from mjxfly.figures import Flown
@@ -19,7 +20,6 @@ from mjxfly.limits import FlightSettings
 from mjxfly.mocap import Mocap
 from mjxfly.monitor import Monitor, Sustained, UplinkWatch, link_faults
 from mjxfly.packets import ZERO, PacketError, Setpoint
-from mjxfly.policy_setup import FlightController, PairCommands
 from mjxfly.preflight import SpinCheck
 from mjxfly.setpoints import SPIN_THRUST, BoundedSetpoint, CommandMap, CurveName, LastKnownState, Variants
 from mjxfly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, FlightState, Supervisor

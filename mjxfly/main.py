@@ -21,13 +21,13 @@ from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxfly import app_flight, clock, limits
 from mjxfly.app import generate
+from mjxfly.controller import FlightController
 from mjxfly.crazyswarm import CrazyswarmPair, read_pair
 from mjxfly.display import live_view
 from mjxfly.limits import FlightSettings, Limits
 from mjxfly.mocap import KINDS, MocapSettings, ready
 from mjxfly.parameters import check_parameters
 from mjxfly.policy_setup import (
-    FlightController,
     ThrustOptions,
     drone_of,
     goal_of,

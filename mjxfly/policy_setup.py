@@ -1,22 +1,19 @@
-"""How a policy is flown, by the metadata in its file: configuration, gains, command maps, goal; both controllers."""
+"""How a policy is flown, by the metadata in its file: configuration, gains, command maps, goal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
-
-import numpy as np
+from typing import Any, Literal
 
 from mjxball import config as configs
 from mjxball.cli import plant_setup
 from mjxball.config import Config
-from mjxball.control import crazyflie, motors, rotations
+from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
-from mjxball.policy import Policy, PolicyFile, load_file, team
-from mjxball.sim.controllers import Body, Controllers
+from mjxball.policy import PolicyFile, load_file, team
 from mjxfly.limits import Limits, Times
 from mjxfly.setpoints import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxfly.telemetry import Rig
@@ -152,41 +149,3 @@ def command_maps(config: Config, choice: ThrustOptions = ThrustOptions()) -> tup
         CommandMap(thrust_model, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried
     )
     return leader, follower
-
-
-class PairCommands(NamedTuple):
-    """Commands of both controllers at one control step."""
-
-    leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
-    follower: np.ndarray  # (3,) likewise
-    observation: np.ndarray  # (18,) of the follower
-    hidden: np.ndarray | None = None  # (H,) state of its GRU after the step; None: no GRU
-
-
-class FlightController:
-    """Leader PID and follower policy, with the gains, limits and control period of the policy's configuration."""
-
-    def __init__(self, policy: Policy):
-        config = config_of(policy.metadata)
-        self.policy, self.config, self.period = policy, config, policy.control_period
-        self._loop, self._angle = Controllers(config), mount_angle(policy.metadata)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a flight: zero the integrals and the policy's hidden state."""
-        self._integral = self._loop.zero_integral(np.zeros(3))
-        self.policy.reset()
-
-    @property
-    def integral(self) -> np.ndarray:
-        """Integrals of both controllers, see `sim.controllers.Controllers`."""
-        return self._integral
-
-    def step(self, state: Body, goal: np.ndarray) -> PairCommands:
-        """Commands at `state` for the `goal` (3,) of O [m]. Call it once per control period."""
-        observation = self._loop.observe(state, goal)
-        leader = self._loop.leader_command(state, goal, self._integral)
-        action = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
-        follower = self._loop.follower_command(rotations.turned_about_z(action, self._angle), self._integral)
-        self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=follower)
-        return PairCommands(leader, follower, observation, self.policy.hidden)

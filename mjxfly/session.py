@@ -20,6 +20,7 @@ from mjxball.errors import InputError
 from mjxfly import clock, packets, positioning
 from mjxfly.app_flight import OnboardApps, OnboardFlight, check_ready
 from mjxfly.connection import LinkError
+from mjxfly.controller import FlightController
 from mjxfly.display import Display, listening
 from mjxfly.figures import LEAST, SETTLING
 from mjxfly.flight import Flight
@@ -27,7 +28,6 @@ from mjxfly.flight_log import Journal
 from mjxfly.limits import NAMES, Check, FlightSettings
 from mjxfly.link import Link
 from mjxfly.mocap import Mocap
-from mjxfly.policy_setup import FlightController
 from mjxfly.preflight import Preflight, check, prepare
 from mjxfly.process import Metronome, Timing, bounded, together, urgent
 from mjxfly.rehearsal import Rehearsal, RehearsalError

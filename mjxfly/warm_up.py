@@ -9,10 +9,10 @@ from __future__ import annotations
 import gc
 from collections.abc import Mapping, Sequence
 
+from mjxfly.controller import FlightController
 from mjxfly.flight import Flight
 from mjxfly.limits import FlightSettings
 from mjxfly.packets import Packet
-from mjxfly.policy_setup import FlightController
 from mjxfly.setpoints import CurveName, Variants
 from mjxfly.supervisor import Event, Fault, FlightState, Supervisor
 from mjxfly.telemetry import DroneLink, Rig, Telemetry

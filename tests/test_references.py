@@ -99,6 +99,6 @@ def test_a_stale_name_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("test_references.REPOSITORY", tmp_path)
     path = tmp_path / "module.py"
     path.write_text(
-        '"""See `mjxfly.link.Link`, `mjxfly.link.Lnk`, `mjxfly/lnk.py` and `policy_setup.FlightController.step`."""\n'
+        '"""See `mjxfly.link.Link`, `mjxfly.link.Lnk`, `mjxfly/lnk.py` and `controller.FlightController.step`."""\n'
     )
     assert [line.rpartition(": ")[2] for line in stale(path)] == ["mjxfly.link.Lnk", "mjxfly/lnk.py"]

@@ -94,27 +94,27 @@ def make_update(
     target_entropy = config.target_entropy * action_size
 
     def value_step(
-        learner: Learner, batch: Any, noise: Float[Array, "batch actions"], step: Float[Array, ""]
+        learner: Learner, batch: Any, noise: Float[Array, "batch actions"], learning_rate: Float[Array, ""]
     ) -> tuple[Learner, Float[Array, ""]]:
         """The paper's eqs. 6 and 7: V follows Q and the entropy, Q follows the reward and the slow V."""
         value_gradient = mean(jax.grad(value_loss)(learner.value, learner, batch, noise))
         loss, gradient = jax.value_and_grad(q_loss)(learner.critic, learner, batch)
-        value, value_adam = _descend(learner.value, value_gradient, learner.value_adam, step)
-        critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, step)
+        value, value_adam = _descend(learner.value, value_gradient, learner.value_adam, learning_rate)
+        critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, learning_rate)
         target = optax.incremental_update(value, learner.target, config.tau)
         moved = learner._replace(value=value, critic=critic, target=target, value_adam=value_adam, critic_adam=adam)
         return moved, loss
 
     def critic_step(
-        learner: Learner, batch: Any, noise: Float[Array, "batch actions"], step: Float[Array, ""]
+        learner: Learner, batch: Any, noise: Float[Array, "batch actions"], learning_rate: Float[Array, ""]
     ) -> tuple[Learner, Float[Array, ""]]:
         alpha = jnp.exp(learner.log_alpha)
-        value, gradient = jax.value_and_grad(critic_loss)(
+        loss, gradient = jax.value_and_grad(critic_loss)(
             learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, noise
         )
-        critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, step)
+        critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, learning_rate)
         target = optax.incremental_update(critic, learner.target, config.tau)
-        return learner._replace(critic=critic, critic_adam=adam, target=target), value
+        return learner._replace(critic=critic, critic_adam=adam, target=target), loss
 
     def outputs(policy: Any, normaliser: Any, seen: Float[Array, "... n"]) -> Float[Array, "batch parameters"]:
         """Distribution parameters at `seen`, observations (batch, n) or sequences of them (steps, sequences, n)."""
@@ -138,8 +138,8 @@ def make_update(
         alpha, entropy = jnp.exp(before.log_alpha), -mean(jnp.mean(distribution.log_prob(output, action)))
         value, slope = jax.value_and_grad(policy_loss)(output, before.normaliser, before.critic, alpha, batch, noise)
         (gradient,) = back(slope)
-        step = rate * config.learning_rate
-        policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, step)
+        learning_rate = rate * config.learning_rate
+        policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, learning_rate)
         # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
         rise = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
         log_alpha, alpha_adam = _descend(before.log_alpha, rise, before.alpha_adam, rate * ALPHA_LEARNING_RATE)
@@ -160,12 +160,12 @@ def make_update(
         seen: Float[Array, "steps sequences n"] | None = None,
     ) -> tuple[Learner, Losses]:
         transitions = _brax_transitions(batch)
-        evaluate = value_step if config.state_value else critic_step
-        moved, critic_value = evaluate(learner, transitions, noise[0], rate * config.learning_rate)
+        improve_critic = value_step if config.state_value else critic_step
+        moved, loss = improve_critic(learner, transitions, noise[0], rate * config.learning_rate)
         moved, losses = policy_step(
             learner, moved, batch.observation if seen is None else seen, transitions, noise[1], rate
         )
-        return moved, losses._replace(critic=critic_value)
+        return moved, losses._replace(critic=loss)
 
     return update
 
@@ -198,10 +198,10 @@ def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
     return value_loss, q_loss
 
 
-def _descend(value: Any, gradient: Any, adam: Any, step: Float[Array, ""]) -> tuple[Any, Any]:
-    """(`value`, state of Adam) after one step of Adam with learning rate `step`."""
+def _descend(value: Any, gradient: Any, adam: Any, learning_rate: Float[Array, ""]) -> tuple[Any, Any]:
+    """(`value`, state of Adam) after one step of Adam with `learning_rate`."""
     direction, adam = ADAM.update(gradient, adam)
-    return jax.tree.map(lambda v, d: v - step * d, value, direction), adam
+    return jax.tree.map(lambda v, d: v - learning_rate * d, value, direction), adam
 
 
 def _brax_transitions(batch: Transitions) -> Any:

@@ -27,7 +27,7 @@ EVALUATION_SEED = 20_261_121  # folded into the key, so that no seed trains on t
 
 
 class Mode(NamedTuple):
-    """Number of steps and phase of a call of `TrainingProgram.advance`. Both are traced: one executable serves all."""
+    """Number of steps and phase of a call of `Population.advance`. The phase is traced: one executable serves all."""
 
     steps: Int[Array | np.ndarray, ""]  # of each environment
     phase: TrainingPhase

@@ -17,8 +17,9 @@ from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.sim.controllers import Controllers
 from mjxfly import process
+from mjxfly.controller import FlightController
 from mjxfly.packets import DroneState, unpack_state
-from mjxfly.policy_setup import FlightController, config_of
+from mjxfly.policy_setup import config_of
 from mjxfly.process import Metronome
 from mjxfly.telemetry import Rig, object_state
 

@@ -12,9 +12,10 @@ from tables import weekly
 from mjxball.control.rotations import roll_of_quaternion
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
+from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings, Limits
 from mjxfly.packets import FLYING, LOCKED
-from mjxfly.policy_setup import FlightController, goal_of, times_of
+from mjxfly.policy_setup import goal_of, times_of
 from mjxfly.preflight import curve_of_version
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind

@@ -15,12 +15,12 @@ from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly import measured, probe
+from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings
 from mjxfly.measured import CONTRADICTING, REPEATING, WINDOW, DroneWatch, ImuWatch, Repeats
 from mjxfly.mocap_supervision import Frame as PoseFrame
 from mjxfly.mocap_supervision import Pose
 from mjxfly.packets import DroneState
-from mjxfly.policy_setup import FlightController
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import Sample
 from mjxfly.twin.conditions import Surroundings

@@ -7,8 +7,9 @@ import pytest
 from mjxball.control.crazyflie import PARAMETERS, Gains, pair_gains
 from mjxball.errors import InputError
 from mjxball.policy import Policy, shipped_policy
+from mjxfly.controller import FlightController
 from mjxfly.parameters import check_parameters
-from mjxfly.policy_setup import FlightController, load_policy, variants
+from mjxfly.policy_setup import load_policy, variants
 
 
 def refused(name: str, leader: Gains, follower: Gains) -> str:

@@ -12,8 +12,9 @@ from tables import weekly
 from mjxball.control import rotations
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.policy.team import is_for_any
+from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings, Times
-from mjxfly.policy_setup import FlightController, goal_of, limits_of, load_policy
+from mjxfly.policy_setup import goal_of, limits_of, load_policy
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.takeoff import BEGIN, MOST_LIFT, TakeOff

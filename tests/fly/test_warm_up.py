@@ -21,7 +21,7 @@ BENCHMARKS = Path(virtual_twin.__file__).parent
 FIRST = """
 import json, sys
 sys.path.append(sys.argv[2])
-from mjxfly.policy_setup import FlightController
+from mjxfly.controller import FlightController
 from mjxfly.flight import Flight
 from mjxfly.limits import FlightSettings
 from mjxfly.telemetry import Rig

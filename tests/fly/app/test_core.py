@@ -16,7 +16,7 @@ from mjxball.sim.controllers import Controllers
 from mjxfly.app import generate, protocol
 from mjxfly.app.host import App
 from mjxfly.app.protocol import CAUSES, AppPhase
-from mjxfly.policy_setup import FlightController
+from mjxfly.controller import FlightController
 from mjxfly.telemetry import ObjectState, Rig
 
 

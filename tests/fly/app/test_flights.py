@@ -16,7 +16,7 @@ from mjxball.control import rotations
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxfly.app.protocol import AppPhase
-from mjxfly.policy_setup import FlightController
+from mjxfly.controller import FlightController
 from mjxfly.supervisor import FlightState as Laptop
 from mjxfly.twin import avionics
 from mjxfly.twin.conditions import FAULT_KINDS, Conditions, Surroundings, drone_kind

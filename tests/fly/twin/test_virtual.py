@@ -12,8 +12,9 @@ from mjxball import config as configs
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxfly import packets
+from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings
-from mjxfly.policy_setup import FlightController, goal_of, variants
+from mjxfly.policy_setup import goal_of, variants
 from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import Conditions, Surroundings, drone_kind
 from virtual_twin import VirtualTwin

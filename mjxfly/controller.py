@@ -1,0 +1,52 @@
+"""The controllers of a pair in flight: one control step of the leader's PID and the follower's policy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.control import rotations
+from mjxball.policy import Policy
+from mjxball.sim.controllers import Body, Controllers
+from mjxfly.policy_setup import config_of, mount_angle
+
+
+class PairCommands(NamedTuple):
+    """Commands of both controllers at one control step."""
+
+    leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
+    follower: np.ndarray  # (3,) likewise
+    observation: np.ndarray  # (18,) of the follower
+    hidden: np.ndarray | None = None  # (H,) state of its GRU after the step; None: no GRU
+
+
+class FlightController:
+    """Leader PID and follower policy, with the gains, limits and control period of the policy's configuration."""
+
+    def __init__(self, policy: Policy):
+        config = config_of(policy.metadata)
+        self.policy, self.config, self.period = policy, config, policy.control_period
+        self._controllers, self._angle = Controllers(config), mount_angle(policy.metadata)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a flight: zero the integrals and the policy's hidden state."""
+        self._integral = self._controllers.zero_integral(np.zeros(3))
+        self.policy.reset()
+
+    @property
+    def integral(self) -> np.ndarray:
+        """Integrals of both controllers, see `sim.controllers.Controllers`."""
+        return self._integral
+
+    def step(self, state: Body, goal: np.ndarray) -> PairCommands:
+        """Commands at `state` for the `goal` (3,) of O [m]. Call it once per control period."""
+        observation = self._controllers.observe(state, goal)
+        leader = self._controllers.leader_command(state, goal, self._integral)
+        command = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
+        follower = self._controllers.follower_command(rotations.turned_about_z(command, self._angle), self._integral)
+        self._integral = self._controllers.integrate(
+            self._integral, state, goal, self.period, follower_command=follower
+        )
+        return PairCommands(leader, follower, observation, self.policy.hidden)
