@@ -249,6 +249,7 @@ FAULT_KINDS = {
     "fade": FaultKind(BodyFault("fade", 0.5), "its battery loses 0.5 V a second"),
     "weak": FaultKind(BodyFault("gain", 0.9), "its motors give 10 % less"),
 }
+BODY_FAULTS = {kind.what.what for kind in FAULT_KINDS.values() if isinstance(kind.what, BodyFault)}
 
 
 class Injection(NamedTuple):

@@ -15,7 +15,7 @@ from mjxfly.app.host import App, Library, OnboardState
 from mjxfly.app.protocol import CONTROLLER, GROUP, OUT_OF_TREE, PID
 from mjxfly.packets import ZERO, Setpoint
 from mjxfly.twin import avionics
-from mjxfly.twin.conditions import FAULT_KINDS, BodyFault, DroneFaults, FaultEffect, LinkFaults
+from mjxfly.twin.conditions import BODY_FAULTS, FAULT_KINDS, BodyFault, DroneFaults, FaultEffect, LinkFaults
 from mjxfly.twin.firmware import Firmware, Motors, Order
 from mjxfly.twin.logs import Readings, Snapshot
 from mjxfly.twin.pair import Pair, PairState, SupervisorOutputs
@@ -103,14 +103,12 @@ class TwinDrone:
 
     def inject(self, what: FaultEffect) -> None:
         """Inject a fault; "port" is handled by the server. Raises InputError for what is no fault."""
-        if what not in [kind.what for kind in FAULT_KINDS.values()]:
-            raise InputError(f"{what!r} is no fault; expected FAULT_KINDS[kind].what, kind of {', '.join(FAULT_KINDS)}")
         match what:
             case LinkFaults():
                 self.link = what
             case DroneFaults():
                 self.faults = what
-            case BodyFault(part, value):
+            case BodyFault(part, value) if part in BODY_FAULTS:
                 self._pair.disturb(self.number, part, value)
             case "crash":  # the firmware detects a crash: motors off
                 self.firmware.supervisor.crash()
@@ -119,6 +117,10 @@ class TwinDrone:
                 self.link = LinkFaults(silent_up=True, silent_down=True)
             case "reboot":
                 self.reboot()
+            case "port":
+                pass
+            case _:
+                raise InputError(f"{what!r} is no fault; expected FAULT_KINDS[kind].what of {', '.join(FAULT_KINDS)}")
 
     def answer(self, now: float) -> None:
         """Handle the datagrams that have arrived by `now` [s]."""

@@ -23,7 +23,16 @@ from mjxfly.connection import LinkError
 from mjxfly.link import Link
 from mjxfly.main import main as fly
 from mjxfly.mocap import Mocap, MocapSettings
-from mjxfly.twin.conditions import DELIVERED, DRONES, FAULT_KINDS, POSITIONING, BodyFault, Conditions, Surroundings
+from mjxfly.twin.conditions import (
+    DELIVERED,
+    DRONES,
+    FAULT_KINDS,
+    POSITIONING,
+    BodyFault,
+    Conditions,
+    LinkFaults,
+    Surroundings,
+)
 from mjxfly.twin.coupled import CoupledPair
 from mjxfly.twin.drone import ACTED, TwinDrone, only_kept
 from mjxfly.twin.firmware import Motors
@@ -63,6 +72,7 @@ def test_what_is_no_fault_is_refused() -> None:
     for kind in FAULT_KINDS.values():
         drone.inject(kind.what)
     assert drone.faults == FAULT_KINDS["killed"].what
+    drone.inject(LinkFaults(loss=0.1, delay=0.01))  # as `--loss` and `--delay` ask for
 
 
 def test_a_controller_that_the_twin_lacks_keeps_its_motors_still() -> None:
