@@ -173,8 +173,8 @@ def measure(count: int, paths: tuple[str, ...], stand: str, states: int, rigs: i
         row: Row = {"drones": count, "load": f"{path} ({axis})", "stand": stand, "states": states}
         row["closed form"] = max(map(difference, constant, expected, cases))
         together = stacked([case[1:] for case in cases])
-        for engine, controller in functions.items():
-            found = controller[name](numbers, *together)
+        for engine, function in functions.items():
+            found = function[name](numbers, *together)
             each = [jax.tree.map(lambda leaf: leaf[rig], found) for rig in range(rigs)]  # noqa: B023
             row[engine] = max(map(difference, each, expected, cases))
         yield row

@@ -206,14 +206,14 @@ def minimise(
 def main() -> None:
     """Search, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("law", nargs="?", choices=TUNED, default="observer")
+    parser.add_argument("controller", nargs="?", choices=TUNED, default="observer")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--width", type=float, default=WIDTH, help="of the first steps, in the logarithm")
     parser.add_argument("--sets", type=int, default=SETS, help="of gains in each round")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
-    controller = TUNED[options.law]
-    team = options.law == "mpc-team"
+    controller = TUNED[options.controller]
+    team = options.controller == "mpc-team"
     given = controller.team_tuning if team else controller.tuning if controller is Mpc else controller.gains
     start = np.log([getattr(given, name) for name in searched(given)])
     if team:
@@ -233,7 +233,7 @@ def main() -> None:
         shown = costs(controller, np.exp([best]))[1]
     gains = dict(zip(searched(given), np.exp(best).tolist(), strict=True))
     rounded = [{key: round(float(np.ravel(value)[0]), 3) for key, value in one.items()} for one in shown]
-    found = {"law": options.law, "gains": gains, "cost": least, "medians": rounded}
+    found = {"controller": options.controller, "gains": gains, "cost": least, "medians": rounded}
     print(json.dumps(found))
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n")

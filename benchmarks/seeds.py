@@ -41,7 +41,7 @@ from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
 from mjxball.arrays import Array
 from mjxball.baselines import CONTROLLERS, make_baseline
-from mjxball.bench.scores import by_variant, run_benchmark
+from mjxball.bench.scores import by_variant, fly_suites
 from mjxball.bench.success import Bound, limits
 from mjxball.bench.suites import Suite, Variant
 from mjxball.cli import run_command
@@ -199,7 +199,7 @@ def fly_others(config: Config) -> dict[str, list[Row]]:
     rivals = [make_baseline(name, config) for name in CONTROLLERS if name != "oracle"]
     rivals += [load_policy(shipped_policy(name), config) for name in RIVALS]
     levels, beyond = [], []
-    scores = run_benchmark(config, rivals, read_levels(), FLIGHTS, "newton-euler", print)
+    scores = fly_suites(config, rivals, read_levels(), FLIGHTS, "newton-euler", print)
     for (suite, label), flown in by_variant(scores).items():
         row: Row = {"suite": suite, "level": label}
         for name in METRICS:

@@ -27,7 +27,6 @@ import numpy as np
 from mjxball import Policy, Scenario
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
-from mjxball.control.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
 from mjxball.evaluate.paper_figures import plot_figure
 from mjxball.evaluate.plots import PANELS, plot_flights
 from mjxball.evaluate.results import fly_scenarios, scenario_title
@@ -36,6 +35,7 @@ from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save,
 from mjxball.policy.file import policy_path, shipped_policy
 from mjxfly.log import result_of, without_goal
 from mjxfly.recording import read_recording
+from mjxfly.rig.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
 
 REPOSITORY = Path(__file__).parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

@@ -13,11 +13,11 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control.axes import Axis, axes
 from mjxball.control.crazyflie import PARAMETERS, PairGains, pair_gains, with_gains
-from mjxball.control.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxball.errors import InputError
 from mjxball.reading import near
 from mjxfly.limits import NAMES
 from mjxfly.policy_setup import is_crazyflie, with_curve
+from mjxfly.rig.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxfly.setpoints import CurveName
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters

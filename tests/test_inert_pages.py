@@ -17,7 +17,7 @@ from mjxball.baselines import make_baseline
 from mjxball.bench import report as report_page
 from mjxball.bench import suites
 from mjxball.bench.report import write_report
-from mjxball.bench.scores import run_benchmark
+from mjxball.bench.scores import fly_suites
 from mjxball.config import preset
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.view.page import flight_page, page_contents
@@ -47,7 +47,7 @@ def test_a_report_of_a_follower_with_a_hostile_name(browser: Any, tmp_path: Path
     variant = suite.variants[0]
     pages = {}
     short = dataclasses.replace(variant, scenario=dataclasses.replace(variant.scenario, seconds=24.0))
-    flown = run_benchmark(
+    flown = fly_suites(
         config, [make_baseline("copy", config)], [dataclasses.replace(suite, variants=(short,))], 1, "newton-euler"
     )
     for label, text in (("plain", "plain"), ("hostile", TEXT)):

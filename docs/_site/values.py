@@ -25,7 +25,6 @@ from mjxball.config import Autopilot, apply_overrides, preset, total_mass  # noq
 from mjxball.control import crazyflie, motors  # noqa: E402
 from mjxball.control.axes import axes  # noqa: E402
 from mjxball.control.constants import hover  # noqa: E402
-from mjxball.control.margins import REQUIREMENTS  # noqa: E402
 from mjxball.plant import plant_parameters  # noqa: E402
 from mjxball.plant.trim import largest_amplitude  # noqa: E402
 from mjxball.policy import file  # noqa: E402
@@ -35,6 +34,7 @@ from mjxball.sim.rigs import HELD_OUT_RIGS  # noqa: E402
 from mjxfly.limits import Limits, Times  # noqa: E402
 from mjxfly.mocap_supervision import MocapLimits  # noqa: E402
 from mjxfly.preflight import Preflight  # noqa: E402
+from mjxfly.rig.margins import REQUIREMENTS  # noqa: E402
 from mjxfly.twin.conditions import Battery  # noqa: E402
 from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
 

@@ -120,7 +120,7 @@ class Transition(NamedTuple):
     done: Float[Array, " envs"]  # 1. if the episode ended
 
 
-class Environments(Protocol):
+class EnvironmentBatch(Protocol):
     """Batch of environments as an algorithm sees it, implemented in `mjxball.train.environments`."""
 
     count: int  # of this shard
@@ -137,7 +137,7 @@ class Environments(Protocol):
         """Reset those of `envs` whose episode ended, and `others`, to initial states sampled with `key`."""
         ...
 
-    def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
+    def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> EnvironmentBatch:
         """The same environments, with the step of a single one batched by `transform`, such as `jax.vmap`."""
         ...
 
@@ -170,7 +170,7 @@ class Algorithm(Protocol):
     update_keys: int  # number of random keys that `update` takes
     steps_per_collect: int  # steps of every environment in one `collect`
 
-    def __init__(self, config: Config, environments: Environments): ...
+    def __init__(self, config: Config, environments: EnvironmentBatch): ...
 
     def init(self, key: Array) -> Any:
         """Initial state: any pytree of arrays, none of them empty."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mjxball.algorithms.base import Environments, PolicyNetwork, Schedule, TrainingPhase
+from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase
 from mjxball.algorithms.recurrent import fresh_layers
 from mjxball.arrays import Array
 from mjxball.config import Config
@@ -71,7 +71,7 @@ class FirstOrderGradient:
     collect_keys = 1
     update_keys = 0
 
-    def __init__(self, config: Config, environments: Environments):
+    def __init__(self, config: Config, environments: EnvironmentBatch):
         settings = config.gradient
         # In scalar form a window's gradient takes a quarter of the time, and two thirds to compile. It has no
         # forward-mode gradient, which impulse responses need.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import Environments, PolicyNetwork, Schedule, TrainingPhase, Transition
+from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase, Transition
 from mjxball.algorithms.networks import normaliser
 from mjxball.algorithms.recurrent import RecurrentPolicy, answer
 from mjxball.config import Config, Ppo
@@ -51,7 +51,7 @@ class ProximalPolicyOptimization:
     collect_keys = 2
     update_keys = 1
 
-    def __init__(self, config: Config, environments: Environments):
+    def __init__(self, config: Config, environments: EnvironmentBatch):
         ppo, slots = config.ppo, environments.recurrent_slots
         self._units = slots.stop - slots.start
         self._config, self._environments, self._shards = ppo, environments, environments.shards

@@ -13,7 +13,7 @@ import optax
 from jax import Array
 
 from mjxball.algorithms import replay
-from mjxball.algorithms.base import Environments, PolicyNetwork, Schedule, TrainingPhase
+from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase
 from mjxball.algorithms.networks import Networks, make_networks
 from mjxball.algorithms.recurrent import answer
 from mjxball.algorithms.replay import Replay, Transitions
@@ -233,7 +233,7 @@ class SoftActorCritic:
     update_keys = 2
     steps_per_collect = 1
 
-    def __init__(self, config: Config, environments: Environments):
+    def __init__(self, config: Config, environments: EnvironmentBatch):
         self._config, self._environments, self._shards = config.sac, environments, environments.shards
         sac = config.sac
         # At least one batch and one n-step window must be recorded before the first update.

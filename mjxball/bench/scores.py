@@ -100,7 +100,7 @@ def _median(rows: np.ndarray) -> np.ndarray:
     return np.sort(rows, axis=1)[:, rows.shape[1] // 2]
 
 
-def run_benchmark(
+def fly_suites(
     base: Config,
     followers: Sequence[Follower],
     suites: Sequence[Suite],

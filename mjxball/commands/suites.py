@@ -9,7 +9,7 @@ from pathlib import Path
 from mjxball import cli
 from mjxball.baselines import SUITE_BASELINES
 from mjxball.bench.report import write_report
-from mjxball.bench.scores import run_benchmark, text_table
+from mjxball.bench.scores import fly_suites, text_table
 from mjxball.bench.suites import BY_NAME, list_suites
 from mjxball.commands.followers import add_flight, add_followers, add_policies, clock, load, named, refuse_same_names
 from mjxball.config import preset
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace, command: str) -> int:
     policies = load(paths, lambda path: setup, options.force, seconds=longest)
     followers = [*selected.made(setup, SUITE_BASELINES), *policies]
     refuse_same_names([follower.name for follower in followers])
-    scores = run_benchmark(setup, followers, suites, options.num_seeds, options.physics, clock())
+    scores = fly_suites(setup, followers, suites, options.num_seeds, options.physics, clock())
     print(text_table(scores, suites))
     if options.json:
         write_atomically(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")

@@ -237,11 +237,11 @@ def _check_version(metadata: dict[str, Any], name: str) -> None:
 
 def _check_metadata(metadata: dict[str, Any], name: str) -> None:
     _check_version(metadata, name)
-    for fault in _card_faults(metadata):
+    for fault in _metadata_faults(metadata):
         raise PolicyFileError(f"{name}: {fault}")
 
 
-def _card_faults(metadata: dict[str, Any]) -> Iterator[str]:
+def _metadata_faults(metadata: dict[str, Any]) -> Iterator[str]:
     """Phrases on what is wrong with the metadata of a policy; after the first one others need not be right."""
     for field, kind in METADATA_FIELDS.items():
         value = metadata.get(field)

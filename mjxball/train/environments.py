@@ -101,7 +101,7 @@ SHARED = ("done", "metrics", "info")  # fields of a state that all followers of 
 
 
 class Environments:
-    """`count` environments on each shard; see `mjxball.algorithms.base.Environments`.
+    """`count` environments on each shard; see `mjxball.algorithms.base.EnvironmentBatch`.
 
     Besides Brax's `Env` interface, an environment may have `input_mask` and `critic_mask` (n,), and `report` (above).
     One with `team_sizes` has several followers (see `mjxball.env`). Each follower then counts as one environment:
@@ -154,17 +154,17 @@ class Environments:
         return Envs(states, Statistics(zero, zero, totals, peaks))
 
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
-        """See `mjxball.algorithms.base.Environments`."""
+        """See `mjxball.algorithms.base.EnvironmentBatch`."""
         other = copy.copy(self)
         other._step = transform(self.env.step)
         return other
 
     def sampled(self, envs: Envs, key: Array) -> Any:
-        """See `mjxball.algorithms.base.Environments`."""
+        """See `mjxball.algorithms.base.EnvironmentBatch`."""
         return self.reset(key)
 
     def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
-        """See `mjxball.algorithms.base.Environments`."""
+        """See `mjxball.algorithms.base.EnvironmentBatch`."""
         done = envs.states.done.astype(bool)
         ended = done if others is None else done | others
 
@@ -194,7 +194,7 @@ class Environments:
     def step(
         self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None, fresh: Any = None
     ) -> tuple[Envs, Transition]:
-        """See `mjxball.algorithms.base.Environments`."""
+        """See `mjxball.algorithms.base.EnvironmentBatch`."""
         before, agents = envs.states, self._agents
         if agents:
             after = agents.per_agent(self._step(agents.per_world(before), action[agents.table]))

@@ -204,7 +204,7 @@ static bool compute_command(mjxball_app *app, const pair_state *pair, const floa
         turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
 #endif
         if (!app->copying) good = !mjxball_follow(&app->follower, observation, app->action, command);
-        if (app->copying || !good) mjxball_copy_law(observation, command);
+        if (app->copying || !good) mjxball_copy_command(observation, command);
 #ifdef MJXBALL_MOUNT_ANGLE
         turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
 #endif

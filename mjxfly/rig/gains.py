@@ -10,7 +10,9 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.control.crazyflie import gains_to_json, pair_gains
-from mjxball.control.margins import (
+from mjxball.errors import InputError
+from mjxball.files import write_atomically
+from mjxfly.rig.margins import (
     REQUIREMENTS,
     AxisDesign,
     Gains,
@@ -20,8 +22,6 @@ from mjxball.control.margins import (
     design,
     nominal_and_worst,
 )
-from mjxball.errors import InputError
-from mjxball.files import write_atomically
 
 PRESETS = ("flight", "stand")
 

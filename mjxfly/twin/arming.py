@@ -114,7 +114,7 @@ def after(phase: ArmingPhase, now: Conditions) -> ArmingPhase:
     return next((new for test, new in TRANSITIONS[phase] if test(now)), phase)
 
 
-class Supervisor:
+class FirmwareSupervisor:
     """Supervisor of one drone; `look`, its update, is called every `PERIOD`."""
 
     def __init__(self, kind: DroneKind, now: float = 0.0, booted: bool = True):

@@ -25,7 +25,7 @@ from mjxfly.twin.protocol import Peer
 
 GRAVITY = 9.81  # [m/s2]
 BEAT = 2  # periods of an app between two heartbeats
-# Parameters of the supervisor: attribute of `Supervisor`, and factor to its unit.
+# Parameters of the supervisor: attribute of `FirmwareSupervisor`, and factor to its unit.
 SUPERVISOR = {
     "supervisor.prefltTimeout": ("preflight_time", 1e-3),
     "supervisor.landedTimeout": ("landed_time", 1e-3),

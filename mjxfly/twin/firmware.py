@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from mjxfly.packets import ZERO, Setpoint
-from mjxfly.twin.arming import AIRBORNE, PERIOD, ArmingPhase, Supervisor
+from mjxfly.twin.arming import AIRBORNE, PERIOD, ArmingPhase, FirmwareSupervisor
 from mjxfly.twin.conditions import DELIVERED, DroneKind
 
 THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors off; above: clipped
@@ -99,7 +99,7 @@ class Firmware:
         self._start(now, booted=True)
 
     def _start(self, now: float, booted: bool) -> None:
-        self.supervisor = Supervisor(self.kind, now, booted)
+        self.supervisor = FirmwareSupervisor(self.kind, now, booted)
         self.commander = Commander(now)
         self.order = Order(ZERO, Motors.RUN if self.supervisor.motors_allowed else Motors.OFF)
         self.dead = False  # without power

@@ -16,7 +16,7 @@ from mjxball.baselines import make_baseline
 from mjxball.bench import report as report_page
 from mjxball.bench import suites
 from mjxball.bench.report import compare, verdict
-from mjxball.bench.scores import Score, bootstrap, by_variant, run_benchmark, wins
+from mjxball.bench.scores import Score, bootstrap, by_variant, fly_suites, wins
 from mjxball.bench.suites import Suite
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.config import preset
@@ -41,7 +41,7 @@ def shortened(name: str, seconds: float = 24.0) -> Suite:
 def scores() -> list[Score]:
     """Three followers on two short suites, two seeds."""
     followers = [make_baseline(name, CONFIG) for name in ("copy", "adaptive", "oracle")]
-    return run_benchmark(CONFIG, followers, [shortened(name) for name in SHORT], 2, "newton-euler")
+    return fly_suites(CONFIG, followers, [shortened(name) for name in SHORT], 2, "newton-euler")
 
 
 def test_every_variant_is_sound_for_every_seed() -> None:

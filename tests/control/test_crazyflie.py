@@ -173,21 +173,21 @@ class TestMotors:
 
 
 class TestSent:
-    @pytest.mark.parametrize("controller", ["calibrated", "paper"])
+    @pytest.mark.parametrize("thrust_law", ["calibrated", "paper"])
     @pytest.mark.parametrize("curve", [OLDER, LINEAR], ids=["older", "2026.04"])
     @given(
         st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-8, 8)),
         st.floats(0.03, 0.045),
     )
-    def test_simulation_and_flight_send_the_same_numbers(self, controller: str, curve, command, mass: float) -> None:
-        config = dataclasses.replace(STOCK, thrust_law=controller, motor_curve=curve)
+    def test_simulation_and_flight_send_the_same_numbers(self, thrust_law: str, curve, command, mass: float) -> None:
+        config = dataclasses.replace(STOCK, thrust_law=thrust_law, motor_curve=curve)
         simulated = crazyflie.setpoints(config, np.array(command), np.array(mass), 9.81)
-        free = CommandMap(controller, carried_mass=mass, curve=ForceCurve(*curve))
+        free = CommandMap(thrust_law, carried_mass=mass, curve=ForceCurve(*curve))
         flown = to_setpoint(np.array(command), free).setpoint
         # float32 on the wire: 1e-7 of 15 degrees. A thrust half way between two units may round either way.
         np.testing.assert_allclose(simulated[:3], packets.unpack_setpoint(packets.pack_setpoint(flown))[:3], atol=2e-6)
         assert abs(simulated[3] - flown.thrust) <= (
-            0 if controller == "paper" and command[2] == round(command[2]) else 1
+            0 if thrust_law == "paper" and command[2] == round(command[2]) else 1
         )
         assert simulated[3] == round(simulated[3])
         assert packets.THRUST_FLOOR <= simulated[3] <= packets.THRUST_CEILING

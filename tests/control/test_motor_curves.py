@@ -46,10 +46,10 @@ class TestConversion:
         for vertical in (-0.1, 0.0, 0.1):
             forces = [
                 crazyflie.motor_force(
-                    controller.motor_curve,
-                    np.float64(controller.hover_thrust + controller.thrust_per_acceleration * vertical),
+                    autopilot.motor_curve,
+                    np.float64(autopilot.hover_thrust + autopilot.thrust_per_acceleration * vertical),
                 )
-                for controller in (config.autopilot, uncompensated.autopilot)
+                for autopilot in (config.autopilot, uncompensated.autopilot)
             ]
             # 100 units off hover the older curve bends by 3e-7 N of 0.09 N.
             assert forces[0] == pytest.approx(forces[1], rel=1e-5)
@@ -163,18 +163,18 @@ class TestDrawnWorlds:
 
 
 def test_rate_share_is_a_factor_on_all_rate_gains() -> None:
-    controller = preset("flight").autopilot
+    autopilot = preset("flight").autopilot
     halved = dataclasses.replace(
-        controller,
+        autopilot,
         **{
-            name: tuple(0.5 * gain for gain in getattr(controller, name))
+            name: tuple(0.5 * gain for gain in getattr(autopilot, name))
             for name in ("roll_rate", "pitch_rate", "yaw_rate")
         },
     )
     euler, rates = np.array([0.02, -0.03, 0.1]), np.array([0.1, 0.2, -0.1])
     loops = crazyflie.start_loops(euler, rates)
     setpoint = np.array([3.0, -2.0, 0.0, 45000.0])
-    mine = crazyflie.cascade(controller, loops, setpoint, euler, rates, rate_share=np.array([0.5]))
+    mine = crazyflie.cascade(autopilot, loops, setpoint, euler, rates, rate_share=np.array([0.5]))
     theirs = crazyflie.cascade(halved, loops, setpoint, euler, rates)
     for one, other in zip(mine, theirs, strict=True):
         np.testing.assert_allclose(one, other, atol=1.0)  # truncation to whole units

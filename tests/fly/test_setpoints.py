@@ -1,4 +1,4 @@
-"""The command map: the paper's thrust controller, the calibrated one, and bounds."""
+"""The command map: the paper's thrust law, the calibrated one, and bounds."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def test_the_calibrated_law_lifts_what_was_asked(roll: float, pitch: float, vert
     st.tuples(*[st.floats(-1e3, 1e3)] * 3),
     st.sampled_from([PAPER, CALIBRATED]),
 )
-def test_every_setpoint_is_within_bounds(controller: tuple[float, ...], constants: CommandMap) -> None:
-    sent = setpoints.to_setpoint(np.array(controller), constants).setpoint
+def test_every_setpoint_is_within_bounds(command: tuple[float, ...], constants: CommandMap) -> None:
+    sent = setpoints.to_setpoint(np.array(command), constants).setpoint
     assert THRUST_FLOOR <= sent.thrust <= THRUST_CEILING
     assert abs(sent.roll) <= 15 + 1e-9
     assert abs(sent.pitch) <= 15 + 1e-9
@@ -56,10 +56,10 @@ def test_every_setpoint_is_within_bounds(controller: tuple[float, ...], constant
 @pytest.mark.parametrize("slot", range(3))
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_number_that_is_not_finite_is_refused(slot: int, value: float) -> None:
-    controller = np.zeros(3)
-    controller[slot] = value
+    command = np.zeros(3)
+    command[slot] = value
     with pytest.raises(PacketError):
-        setpoints.to_setpoint(controller, CALIBRATED)
+        setpoints.to_setpoint(command, CALIBRATED)
 
 
 def test_saturation_is_told() -> None:

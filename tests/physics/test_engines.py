@@ -38,7 +38,7 @@ def relative_difference(found: tuple, expected: tuple) -> float:
 
 
 def jitted(make):
-    """The controller of MJX that `make()` gives, on batches of NumPy arrays, in float64."""
+    """The function of MJX that `make()` gives, on batches of NumPy arrays, in float64."""
     with jax.enable_x64(True):
         batched = jax.jit(jax.vmap(make()))
 

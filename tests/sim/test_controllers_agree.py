@@ -1,4 +1,4 @@
-"""One controller, one home: every function in `control/` gives the same on NumPy and on JAX."""
+"""One function, one home: every function in `control/` gives the same on NumPy and on JAX."""
 
 import inspect
 from collections.abc import Callable
@@ -72,8 +72,8 @@ CASCADE = (
     0.1 * normal(3),
 )
 
-# name -> (controller of arrays alone, its arrays). Clipping happens in some worlds and not in others.
-CONTROLLERS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
+# name -> (function of arrays alone, its arrays). Clipping happens in some worlds and not in others.
+FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.rotate": (rotations.rotate, (MATRIX, normal(3))),
     "rotations.rotate_back": (rotations.rotate_back, (MATRIX, normal(3))),
     "rotations.cross": (rotations.cross, (normal(3), normal(3))),
@@ -139,7 +139,7 @@ CONTROLLERS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     },
 }
 # Computed once in NumPy float64, from the config, not from arrays.
-NOT_CONTROLLERS = {
+OTHERS = {
     "mixer.torque_per_force",
     "crazyflie.unpack",
     "crazyflie.cascade",
@@ -153,7 +153,7 @@ NOT_CONTROLLERS = {
         for name in ("gains_of", "pair_gains", "read_pair_gains", "gains_to_json", "with_gains", "with_stock_gains")
     ),
 }
-each_controller = rows("name", CONTROLLERS)
+each_function = rows("name", FUNCTIONS)
 
 
 def difference(first: Any, second: Any) -> float:
@@ -170,38 +170,38 @@ def test_every_law_is_compared():
         for name, member in inspect.getmembers(module, inspect.isfunction)
         if member.__module__ == module.__name__ and not name.startswith("_")
     }
-    assert public - set(CONTROLLERS) == NOT_CONTROLLERS
+    assert public - set(FUNCTIONS) == OTHERS
 
 
-@each_controller
+@each_function
 def test_float64_agrees(name):
-    controller, arrays = CONTROLLERS[name]
-    expected = controller(*arrays)
+    function, arrays = FUNCTIONS[name]
+    expected = function(*arrays)
     with jax.enable_x64(True):
-        result = jax.jit(controller)(*map(jax.numpy.asarray, arrays))
+        result = jax.jit(function)(*map(jax.numpy.asarray, arrays))
         assert result.dtype == np.float64
     # Both round to 1e-16; sin and cos of the two libraries differ by an ulp; a call back answers in float32.
     assert difference(result, expected) < (1e-6 if name == "baseline mpc" else 1e-10)
 
 
-@each_controller
+@each_function
 def test_float32_agrees(name):
-    controller, arrays = CONTROLLERS[name]
+    function, arrays = FUNCTIONS[name]
     single = [array.astype(np.float32) for array in arrays]
-    on_numpy = controller(*single)
-    on_jax = jax.jit(controller)(*map(jax.numpy.asarray, single))
+    on_numpy = function(*single)
+    on_jax = jax.jit(function)(*map(jax.numpy.asarray, single))
     assert on_numpy.dtype == on_jax.dtype == np.float32
     # float32 rounding, about 1e-5 of full scale; motors' and thrust's commands are whole numbers, of which rounding may
     # move one by 2.
     tolerance = 2.5 / 65535 if name in ("crazyflie.cascade motors", "crazyflie.setpoints") else 1e-5
     assert difference(on_jax, on_numpy) < tolerance
-    assert difference(on_numpy, controller(*arrays)) < tolerance
+    assert difference(on_numpy, function(*arrays)) < tolerance
 
 
-@each_controller
+@each_function
 def test_batch_equals_single(name):
-    controller, arrays = CONTROLLERS[name]
-    batched = controller(*arrays)
-    single = controller(*(array[5] if len(array) == WORLDS else array for array in arrays))
+    function, arrays = FUNCTIONS[name]
+    batched = function(*arrays)
+    single = function(*(array[5] if len(array) == WORLDS else array for array in arrays))
     # The same operations in the same order, but NumPy's vectorised sine may differ by an ulp.
     np.testing.assert_allclose(batched[5], single, rtol=1e-14, atol=1e-15)

@@ -374,7 +374,7 @@ def _leader(metadata: dict[str, Any], to: str) -> list[str]:
 
 def _command(interface: NetworkInterface) -> str:
     """C lines that compute the command from `action`, which is added to the PD command unless the mode is direct."""
-    base = "mjxball_copy_law(observation, command);"
+    base = "mjxball_copy_command(observation, command);"
     return "\n".join(
         [
             f"    {base if interface.residual else 'for (i = 0; i < 3; i++) command[i] = 0;'}",

@@ -80,7 +80,7 @@ static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) 
 }}
 {helpers}
 /* The leader's PD controller on the observed error: the command of the `copy` follower. */
-static inline void mjxball_copy_law(const mjxball_real *observation, mjxball_real *to) {{
+static inline void mjxball_copy_command(const mjxball_real *observation, mjxball_real *to) {{
 {leader}
 }}
 /* Clear the memory: the next call starts a flight. */

@@ -14,7 +14,10 @@ from attitude_trials import Trial, pair, simulate
 from mjxball.cli import read_plant
 from mjxball.config import Autopilot, apply_overrides, preset, with_plant
 from mjxball.control.axes import axes
-from mjxball.control.margins import (
+from mjxball.errors import InputError
+from mjxfly.preflight import read_gains
+from mjxfly.rig import gains as command
+from mjxfly.rig.margins import (
     REQUIREMENTS,
     Gains,
     delivered_gains,
@@ -24,9 +27,6 @@ from mjxball.control.margins import (
     margins,
     worst_margins,
 )
-from mjxball.errors import InputError
-from mjxfly.preflight import read_gains
-from mjxfly.rig import gains as command
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)
