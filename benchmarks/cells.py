@@ -36,7 +36,6 @@ from mjxball.control.followers import Follower
 from mjxball.evaluate.policies import load_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
-from stability import peak
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 AMPLITUDES = (0.05, 0.10, 0.17)
@@ -51,7 +50,7 @@ EFFORT = ("rotors_at_limit", "rotor_power")  # see docs/metrics.md
 def numbers_of(metrics: Any) -> dict[str, float]:
     """What a cell is evaluated by; infinite for a flight that never settled."""
     settling = math.inf if metrics.settling_time is None else metrics.settling_time
-    return {"peak": peak(metrics), "overshoot": metrics.overshoot, "settling": settling, "rmse": metrics.rmse}
+    return {"peak": metrics.axis_peak, "overshoot": metrics.overshoot, "settling": settling, "rmse": metrics.rmse}
 
 
 def scenarios_of(cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Scenario]:

@@ -37,7 +37,7 @@ from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import CgPath, Scenario
-from stability import MARGIN, peak, random_scenarios
+from stability import MARGIN, random_scenarios
 
 FLIGHTS, SETS, ROUNDS, SEED, WIDTH = 48, 24, 80, 1007, 0.3
 CONDITIONS = (Disturbance(), Disturbance(noise=1.0, delay=0.04, seed=SEED))
@@ -95,7 +95,7 @@ def of_teams() -> list[tuple[Config, list[Scenario]]]:
 def cost_of(runs: Sequence[Metrics], allowed: float | None) -> np.ndarray:
     """(n,) what each flight costs; overshoot and RMSE count where some overshoot is `allowed`."""
     settling = np.array([run.settling_time or math.inf for run in runs])
-    parts = np.minimum(settling, 30.0) + np.minimum(1e3 * np.array([peak(run) for run in runs]) / 5, 20.0)
+    parts = np.minimum(settling, 30.0) + np.minimum(1e3 * np.array([run.axis_peak for run in runs]) / 5, 20.0)
     if allowed is None:
         return parts
     over = np.array([1.0 if run.failed else min(max(run.overshoot - allowed, 0.0), 1.0) for run in runs])
@@ -104,7 +104,10 @@ def cost_of(runs: Sequence[Metrics], allowed: float | None) -> np.ndarray:
 
 def medians(runs: Sequence[Metrics], sets: int) -> dict[str, np.ndarray]:
     """Medians (S,) of the settling time [s] and of the peak [mm]."""
-    numbers = {"settling": [run.settling_time or math.inf for run in runs], "peak": [1e3 * peak(run) for run in runs]}
+    numbers = {
+        "settling": [run.settling_time or math.inf for run in runs],
+        "peak": [1e3 * run.axis_peak for run in runs],
+    }
     return {name: np.median(np.reshape(values, (sets, -1)), axis=1) for name, values in numbers.items()}
 
 

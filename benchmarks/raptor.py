@@ -30,7 +30,7 @@ from mjxball import cli
 from mjxball.bench import NAME, VERSION
 from mjxball.bench.entry import CONDITIONS, table
 from mjxball.bench.references import bars
-from mjxball.bench.success import criteria_met, summary
+from mjxball.bench.success import successes, summary
 from mjxball.bench.tracks import TRACKS, World, worlds_of
 from mjxball.config import Config
 from mjxball.control import observation, rotations
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for track in PAIRS:
         (world,) = worlds_of(track, options.draw)
         flown = fly(world, Raptor())
-        met = criteria_met(flown, bars(track, options.draw, 0))
+        met = successes(flown, bars(track, options.draw, 0))
         # There is no attitude command whose change could be measured.
         found[track] = {
             name: {**summary(flown[row::2], met[row::2]), "command_change": None} for row, name in enumerate(CONDITIONS)

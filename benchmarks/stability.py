@@ -252,11 +252,6 @@ def random_scenarios(config: Config, count: int, unknown: bool, seed: int = 0) -
     return scenarios
 
 
-def peak(metrics: Any) -> float:
-    """Largest error of any axis after 20 s [m]."""
-    return math.inf if metrics.failed else max(metrics.x_peak, metrics.y_peak, metrics.z_peak)
-
-
 def main(given: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
     parser = arguments(__file__, __doc__)
@@ -282,7 +277,7 @@ def main(given: Sequence[str] | None = None) -> int:
     table([row for row in rows if not row["stable"]], ("follower", "offset", "mass", "radius"))
     scenarios = random_scenarios(config, options.flights, options.unknown, options.seed)
     flown = fly_compiled(config, policy, scenarios)
-    peaks = [peak(metrics) for metrics in flown]
+    peaks = [metrics.axis_peak for metrics in flown]
     failed = sum(metrics.failed for metrics in flown)
     middle, high, most = map(float, np.quantile(peaks, [0.5, 0.99, 1.0]))
     quantiles = {"median": middle, "99 %": high, "largest": most}

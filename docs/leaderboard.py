@@ -18,7 +18,9 @@ from mjxball.cli import run_command
 from mjxball.errors import InputError
 
 ENTRIES = Path(__file__).parents[1] / "benchmarks" / "leaderboard"
-COLUMNS = "| follower | | met % | 95 % | failed % | settles s | 90 % peak mm | limit % | change mrad | date, commit |"
+COLUMNS = (
+    "| follower | | success % | 95 % | failed % | settles s | 90 % peak mm | limit % | change mrad | date, commit |"
+)
 
 
 @functools.cache
@@ -32,7 +34,7 @@ def entries() -> list[dict[str, Any]]:
 
 
 def table(track: str) -> str:
-    """The rows of one track: the newest first, those of one day by their share met."""
+    """The rows of one track: the newest first, those of one day by their success."""
     flown = sorted(
         (entry for entry in entries() if track in entry["tracks"]),
         key=lambda entry: (entry["date"], [entry["tracks"][track][one]["met"] for one in CONDITIONS]),

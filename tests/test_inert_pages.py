@@ -57,7 +57,7 @@ def test_a_report_of_a_follower_with_a_hostile_name(browser: Any, tmp_path: Path
         policy = Policy(dataclasses.replace(metadata, metadata={**metadata.metadata, "preset": text, text: text}), text)
         write_report(tmp_path / label, config.plant, scores, [own], [policy], f"eval.py {text}", {text: text})
         tab = pages[label] = opened(browser, tmp_path / label / "report.html", 1280)
-        assert tab.title() == "Benchmark of followers"
+        assert tab.title() == "Suites of scenarios"
     plain, hostile = pages["plain"], pages["hostile"]
     assert elements(plain) == elements(hostile)
     assert hostile.inner_text("#verdict-table td >> nth=0") == TEXT

@@ -11,7 +11,7 @@ from typing import Any
 from mjxball.bench import NAME, VERSION
 from mjxball.bench.followers import FollowerFactory, checked
 from mjxball.bench.references import bars
-from mjxball.bench.success import criteria_met, summary
+from mjxball.bench.success import successes, summary
 from mjxball.bench.tracks import FLIGHTS, TRACKS, worlds_of
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
@@ -19,7 +19,7 @@ from mjxball.files import read_text
 from mjxball.reading import parse_json
 
 CONDITIONS = ("undisturbed", "disturbed")
-HEADS = ["track", "", "met %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
+HEADS = ["track", "", "success %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
 # Keys of an entry and their types, besides the benchmark and its version.
 KINDS = {
     **{"draw": int, "follower": str, "date": str, "command": str, "commit": str},
@@ -74,7 +74,7 @@ def measure(track: str, draw: int, make: FollowerFactory, progress: Callable[[st
     for number, (world, follower) in enumerate(zip(worlds, entrants, strict=True)):
         progress(f"{track}: {number + 1}/{len(worlds)}")
         (mine,) = world.fly([follower], [one for pair in world.scenarios for one in pair])
-        flown, succeeded = [*flown, *mine], [*succeeded, *criteria_met(mine, bars(track, draw, number))]
+        flown, succeeded = [*flown, *mine], [*succeeded, *successes(mine, bars(track, draw, number))]
     return {name: summary(flown[row::2], succeeded[row::2]) for row, name in enumerate(CONDITIONS)}
 
 

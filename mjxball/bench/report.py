@@ -46,7 +46,7 @@ def write_report(
     units = [f"{name} {UNITS.get(name, '')}".strip() for name in RANKED]
     picture, caption = lead_picture(plant, scores, [policy.name for policy in policies])
     context = {
-        "title": "Benchmark of followers",
+        "title": "Suites of scenarios",
         "picture": base64.b64encode(picture).decode() if picture else "",
         "caption": caption,
         "pair": plant.count == 2,

@@ -49,7 +49,7 @@ def bar(best: np.ndarray, length: float = 1.0) -> np.ndarray:
     return np.stack([*limits(dict(zip(BOUNDS, best.T, strict=True)), BOUNDS, length).values()], axis=1)
 
 
-def criteria_met(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
+def successes(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
     """Whether each flight succeeds, of `bars` (flights, 3)."""
     return [
         not metrics.failed and bool((np.array(numbers(metrics)) <= most).all())
@@ -57,10 +57,10 @@ def criteria_met(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
     ]
 
 
-def summary(flown: Sequence[Metrics], met: Sequence[bool]) -> dict[str, Any]:
+def summary(flown: Sequence[Metrics], succeeded: Sequence[bool]) -> dict[str, Any]:
     """A track's numbers in one condition; None for what is infinite."""
     peak, settling, _ = np.array([numbers(one) for one in flown]).T
-    interval = binomtest(sum(met), len(met)).proportion_ci(CONFIDENCE, method="wilson")
+    interval = binomtest(sum(succeeded), len(succeeded)).proportion_ci(CONFIDENCE, method="wilson")
     sound = [one for one in flown if not one.failed]
     limit, change = (
         [getattr(one, name) for one in sound if getattr(one, name) is not None]
@@ -68,7 +68,7 @@ def summary(flown: Sequence[Metrics], met: Sequence[bool]) -> dict[str, Any]:
     )
     found = {
         "flights": len(flown),
-        "met": sum(met) / len(met),
+        "met": sum(succeeded) / len(succeeded),
         "low": float(interval.low),
         "high": float(interval.high),
         "failed": sum(one.failed for one in flown) / len(flown),

@@ -16,9 +16,10 @@ def parser() -> cli.Parser:
     """Argument parser of `eval.py`, which also lists the flags of `fly`."""
     result = cli.make_parser(
         "eval.py",
-        description="Judge followers on a CPU. Without a command: fly, whose flags are listed here.",
+        description="Fly followers on a CPU and measure them. Without a command: fly, whose flags are listed here.",
         usage="%(prog)s [COMMAND] [POLICY.npz ...] [--flag ...]",
-        epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios.",
+        epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios. "
+        "Logs of real flights: python -m mjxfly.log.",
     )
     commands = result.add_subparsers(
         title="commands", dest="command", metavar="COMMAND", prog=result.prog, parser_class=cli.Command

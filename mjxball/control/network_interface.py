@@ -1,6 +1,6 @@
-"""What surrounds a follower's network: what it sees and remembers, and how its action becomes a command.
+"""The inputs and memory of a follower's network, and the command that its action becomes.
 
-One for training, for flight and for every export; all functions run on NumPy and on JAX arrays.
+Training, flight and every export use it; all functions run on NumPy and on JAX arrays.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ SATURATED = 6  # such numbers
 
 
 class NetworkInterface(NamedTuple):
-    """What is around the network of one follower.
+    """Between observation, network and command of one follower.
 
-    Its memory (..., m) holds that of `history`, the state of the network's GRU, and its team's geometry.
+    The memory (..., m) holds that of `history`, the state of the network's GRU, and its team's geometry.
     """
 
     history: ObservationHistory

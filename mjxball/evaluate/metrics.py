@@ -48,7 +48,7 @@ class Metrics:
     saturation: float | None  # share of the followers' rotors and all steps at 0 or the largest force
     rotors_at_limit: float | None  # share of steps in which any rotor is within 1 % of 0 or of its largest force
     rotor_power: float | None  # mean of sum F^1.5 over all rotors, over that at the start, hover
-    command_spread: float | None  # rms of the followers' roll and pitch less their mean; None: one follower [rad]
+    command_spread: float | None  # rms of the followers' roll and pitch about their mean; None: one follower [rad]
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
 
     @property
@@ -56,6 +56,12 @@ class Metrics:
         """Root of the squared x, y, z peaks [m]; NaN of a flight too short to have them."""
         peaks = [peak for peak in (self.x_peak, self.y_peak, self.z_peak) if peak is not None]
         return math.hypot(*peaks) if len(peaks) == 3 else math.nan
+
+    @property
+    def axis_peak(self) -> float:
+        """Largest of the x, y, z peaks [m]; inf of a flight that failed."""
+        peaks = (peak for peak in (self.x_peak, self.y_peak, self.z_peak) if peak is not None)
+        return math.inf if self.failed else max(peaks, default=math.nan)
 
 
 class RunningMetrics(NamedTuple):
