@@ -121,7 +121,7 @@ def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
 
 
 def see(own: np.ndarray, mount: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """RAPTOR's input (n, 18) without its last command, of a drone's observation (n, 18): its place less its goal."""
+    """RAPTOR's input (n, 18) without its last command, of a drone's observation (n, 18): its place minus its goal."""
     matrix = np.asarray(rotations.matrix_from_quaternion(rotations.quaternion_from_euler(own[:, 3:6])))
     off = own[:, :3] - goal - mount
     off = off * np.minimum(1.0, NEAR / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-9))

@@ -304,7 +304,7 @@ class Flight:
         return self._take_off.stuck(self.maps)
 
     def _limit(self, state: FlightState) -> float:
-        """How long a state may last [s]."""
+        """Longest duration of a state [s]."""
         times = self.settings.times
         landing = (self._land_height + 0.3) / times.land_speed + times.land_spare
         own = {FlightState.FLY: self.settings.seconds + 1.0, FlightState.LAND: landing}

@@ -1,4 +1,4 @@
-"""What was flown, `python -m mjxfly.log LOG OUT`: figures and errors, or a file for other programs.
+"""Figures and errors of a recorded flight, or a file for other programs: `python -m mjxfly.log LOG OUT`.
 
 LOG is a flight log (.jsonl), a bag or cfclient's folder. OUT ends in .mcap (ROS 2 messages; of .jsonl alone), .csv or
 .parquet; or it is a new directory, for figures of the flight beside the simulation of the same commands.

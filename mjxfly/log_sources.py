@@ -18,7 +18,7 @@ WIDTHS = {"position": 3, "quaternion": 4, "velocity": 3, "along": 3, "rates": 3,
 
 
 class Topic(NamedTuple):
-    """How to read topics by the last part of their name, as in `/cf1/pose`; the part before it is the drone."""
+    """Readers of topics by the last part of their name, as in `/cf1/pose`; the part before it is the drone."""
 
     type: str
     text: str

@@ -130,7 +130,7 @@ FROZEN = "its numbers stand still"
 
 
 def pair_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
-    """How the newest poses of both bodies contradict the rig, empty if they do not or cannot be compared."""
+    """The contradiction between the newest poses of both bodies and the rig, empty if none or not comparable."""
     one, other = tracks[0].last, tracks[1].last
     if one is None or other is None or abs(one.time - other.time) > limits.age:
         return ""

@@ -227,7 +227,7 @@ def decompress_quaternion(packed: int) -> np.ndarray:
             wire[index] = -size if packed & 0x200 else size
             packed >>= 10
     rest = 1.0 - sum(value * value for value in wire)
-    # The square of the largest component is at least 1/4, less half a step of rounding.
+    # The square of the largest component is at least 1/4 minus half a step of rounding.
     if rest < 0.24:
         raise PacketError("the quaternion is not one of unit length")
     wire[largest] = math.sqrt(rest)

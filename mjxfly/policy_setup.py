@@ -1,4 +1,4 @@
-"""How a policy is flown, by the metadata in its file: configuration, gains, command maps, goal."""
+"""Setup of a flight by a policy's metadata: configuration, gains, command maps, goal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the classical followers are built from: the assembly about roll and pitch, and the leader's PID."""
+"""The plant of the classical followers: the assembly about roll and pitch, and the leader's PID."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class AssemblyModel(NamedTuple):
         return own if self.angles is None else rotations.turned_about_z(own, -self.angles)
 
     def of_flight(self, values: Array, axes: int = 0) -> Array:
-        """What of `PrivilegedInfo` is the same for all followers, without their axis before the last `axes`."""
+        """A value of `PrivilegedInfo` that is the same for all followers, without their axis before the last `axes`."""
         return values if self.followers == 1 else values.take(0, axis=values.ndim - axes - 1)
 
     def of_followers(self, values: Array) -> Array:
@@ -70,13 +70,13 @@ class AssemblyModel(NamedTuple):
         return behind if self.leader == 0 else values.__array_namespace__().concat([ahead, behind], axis=-1)
 
     def carried(self, believed_mass: Array) -> Array:
-        """What every drone believes to lift (..., N) with an object of `believed_mass` (...) [kg]."""
+        """Mass that every drone assumes to lift (..., N) with an object of `believed_mass` (...) [kg]."""
         xp = believed_mass.__array_namespace__()
         known, share = (xp.asarray(part, dtype=believed_mass.dtype) for part in (self.known_mass, self.load_share))
         return known + share * believed_mass[..., None]
 
     def corrections(self, wrench: Array, carried: Array, thrust: Array | None = None) -> Array:
-        """What all followers add to their commands (..., F, 3) to give `wrench` (..., 3) about O together.
+        """Addition to all followers' commands (..., F, 3) that gives `wrench` (..., 3) about O together.
 
         Wrench: lift [N], roll and pitch torque [N m]; `carried` (..., N) of all drones; `thrust` (..., N) what they
         give of what they are asked for, None: all of it. Of all that give the wrench, those with the least sum of
@@ -116,7 +116,7 @@ class AssemblyModel(NamedTuple):
         return xp.stack([(lift * y).sum(axis=-1), -(lift * x).sum(axis=-1)], axis=-1)
 
     def without_extra_lift(self, vertical: Array, trim: Array) -> Array:
-        """`vertical` (...) [m/s2] less the extra lift of motors that hold the torques kp `trim` (..., 2) [rad]."""
+        """`vertical` (...) [m/s2] minus the extra lift of motors that hold the torques kp `trim` (..., 2) [rad]."""
         return vertical - self.extra_lift * sum((self.kp[axis] * trim[..., axis]) ** 2 for axis in (0, 1))
 
 

@@ -156,7 +156,7 @@ class Mpc:
         self._states = self._stacked.drive.shape[-2]
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy has solvers of its own."""
+        """A copy gets new solvers."""
         return {**self.__dict__, "_programs": {}}
 
     @property

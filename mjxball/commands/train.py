@@ -233,7 +233,7 @@ def _run(
 
 
 def _rendezvous(options: argparse.Namespace) -> processes.Rendezvous | None:
-    """How the processes of a distributed run find each other; None for a run of one process."""
+    """The rendezvous of a distributed run; None for a run of one process."""
     given = (options.coordinator, options.processes, options.process)
     if options.distributed:
         return processes.Rendezvous(*given)

@@ -1,4 +1,4 @@
-"""How a setting is declared: its default, help text and bounds stand in the dataclass."""
+"""Declaration of a setting in its dataclass: default, help text, bounds."""
 
 from __future__ import annotations
 

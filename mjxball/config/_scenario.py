@@ -9,7 +9,7 @@ from mjxball.config._leaf import Range, sampled, setting
 
 @dataclass(frozen=True)
 class Motion:
-    """How the centre of gravity moves along `plant.cg_axis`, or in the plane where that is xy."""
+    """Motion of the centre of gravity along `plant.cg_axis`, or in the plane where that is xy."""
 
     kind: Literal["sine", "waveform", "rolling"] = setting(
         "sine", "sine: sampled or given per flight; waveform: the samples below; rolling: a free ball with end stops"

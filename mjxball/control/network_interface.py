@@ -49,11 +49,11 @@ class NetworkInterface(NamedTuple):
 
     @property
     def input_size(self) -> int:
-        """How many numbers n of `network_input` are before a GRU's state."""
+        """Size n of `network_input` without a GRU's state."""
         return OBSERVATION_SIZE + self.history.size + (SATURATED if self.units else 0) + self._geometry_size
 
     def mask(self, ignore_position: bool) -> list[float]:
-        """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
+        """1 for each component of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
         shown = self.history.mask(ignore_position)
         return shown + [1.0] * (self.input_size + self.units - len(shown))
 

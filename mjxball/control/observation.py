@@ -1,4 +1,4 @@
-"""What the follower sees, now and remembered, and how its network's output becomes a command.
+"""The follower's observation, its history, and the scaling of its network's action to a command.
 
 Written once, for training and for flight; every function runs on NumPy and on JAX arrays.
 """
@@ -97,7 +97,7 @@ def scale_action(action: Array, tilt_limit: float, vertical_limit: float) -> Arr
 
 
 class ObservationHistory(NamedTuple):
-    """What the network sees besides the newest observation. By default nothing.
+    """Past observations and actions in the network's input. By default none.
 
     The memory (..., m) holds, in this order: for each time constant of `filters` an exponential average of the
     observations (18) and one of the network's actions (3), which is what a linear observer of disturbances needs of
@@ -134,7 +134,7 @@ class ObservationHistory(NamedTuple):
         return xp.concat(parts, axis=-1)
 
     def network_input(self, observation: Array, memory: Array) -> Array:
-        """Input of the network (..., 18 + m): the observation, then the memory, averages less the observation.
+        """Input of the network (..., 18 + m): the observation, then the memory, averages minus the observation.
 
         The difference to an average is a filtered derivative; normalised on its own it keeps its small numbers.
         """

@@ -161,7 +161,7 @@ def update(
 
 
 def _taken(running: RunningMetrics, row: Trajectory, rotor_force_max: Array | float, leader: int) -> Array:
-    """What one control step adds to `RunningMetrics.sums` (n, 9)."""
+    """Contribution of one control step to `RunningMetrics.sums` (n, 9)."""
     xp = row.position.__array_namespace__()
     rotors = _of_followers(row.rotor_force, leader)
     led, followed = row.leader_command[:, None], xp.reshape(row.follower_command, (*rotors.shape[:2], 3))

@@ -117,7 +117,7 @@ def _refuse_other_controllers(path: Path, metadata: dict[str, Any], config: Conf
 
 
 def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
-    """What of the metadata's bounds a policy misses on the reference scenario, one phrase each."""
+    """Bounds in the metadata that a policy misses on the reference scenario, one phrase each."""
     misses = ["the flight failed"] if metrics.failed else []
     for name, bound in sorted(policy.metadata["bounds"].items()):
         value = getattr(metrics, name, None)

@@ -19,7 +19,7 @@ def engine_of(config: Config, physics: str | None) -> str:
     """
     massless = config.scenario.inertia_scale != (1.0, 1.0)
     if massless and physics == "mujoco":
-        raise InputError("C MuJoCo has no inertia without mass, which scenario.inertia_scale draws; use newton-euler")
+        raise InputError("C MuJoCo has no inertia without mass, which scenario.inertia_scale samples; use newton-euler")
     return physics or ("newton-euler" if massless else "mujoco")
 
 

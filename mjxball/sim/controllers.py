@@ -64,7 +64,7 @@ class Controllers:
     Of several followers, F = N - 1, observations are (..., F, 18) and commands (..., F, 3), in the order of
     `plant.followers`; a pair's one follower has no such axis. Followers see and command in their mount frames
     (`observation.mount_angles`), which are the body axes for a pair; commands that leave here are in body axes.
-    `parameters`: the plant's numbers, if they are not those of `config.plant`.
+    `parameters` replace those of `config.plant`.
 
     On a stand, where a drone's estimator invents motion along what is locked, neither controller is fed it: position
     and velocity across, pitch, yaw and their rates are 0.
@@ -96,7 +96,7 @@ class Controllers:
         self._mount_angles = layout.mount_angles(plant, mounts)
 
     def observe(self, state: Body, goal: Vector) -> Observation:
-        """What the followers see; `goal` of O."""
+        """Observations of the followers; `goal` of O [m]."""
         xp = state.position.__array_namespace__()
         state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
@@ -187,7 +187,7 @@ class Controllers:
     ) -> Integral:
         """`integral` one `period` [s] on, in which its error was that at `state`.
 
-        `on_pid`, if given: 1 where the follower flies on it too, 0 where it flies a controller of its own.
+        `on_pid`, if given: 1 where the follower flies on it too, 0 where its command is complete.
         `follower_command`: what a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()

@@ -39,7 +39,7 @@ Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with th
 
 
 class Carry(NamedTuple):
-    """What n flights carry from one control step to the next."""
+    """State of n flights between control steps."""
 
     loop: LoopState
     observation: Float[Array, "n ... 18"]
@@ -47,7 +47,7 @@ class Carry(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What n flights are given in a control step, or with a leading axis in each of T."""
+    """Goals and disturbances of n flights in a control step, or with a leading axis in each of T."""
 
     time: Float[Array, ""]  # at the beginning [s]
     goal: Float[Array, "n 3"]  # of O at the beginning [m]
@@ -216,7 +216,7 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
             offset, _, acceleration = prescribed(state.time + ahead, load)
 
         def each(value: Array, axes: int = 0) -> Array:
-            """What is known of a flight, with the last `axes` of its own, for each of its followers."""
+            """`value` of a flight, whose last `axes` are not the batch's, for each of its followers."""
             if not several:
                 return value
             place = value.ndim - axes

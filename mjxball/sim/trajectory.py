@@ -21,7 +21,7 @@ NOT_RECORDED: Any = None
 
 
 class Trajectory(NamedTuple):
-    """What one flight, or a batch of n flights, did: the one record of every driver, and a pytree.
+    """Record of one flight, or of a batch of n flights, by every driver; a pytree.
 
     All fields have an axis of T control steps first, the start in row 0, and in a batch the flights' axis n second;
     `row` gives a single step, `world` a single flight. What was not recorded is None. Several followers have an axis,
@@ -90,7 +90,7 @@ class Trajectory(NamedTuple):
         return Trajectory(*(None if value is None else value[number] for value in self))
 
     def copied(self) -> Trajectory:
-        """The same with memory of its own: `world` shares that of its whole batch."""
+        """A copy: `world` shares the memory of its whole batch."""
         return self._each(np.array)
 
     def batched(self) -> Trajectory:

@@ -31,7 +31,7 @@ MOST = 4096  # processes; JAX would allocate for a billion
 
 @dataclass(frozen=True)
 class Rendezvous:
-    """How the processes find each other. Without a coordinator JAX asks SLURM, Open MPI or Kubernetes."""
+    """Addresses of a distributed run. Without a coordinator JAX asks SLURM, Open MPI or Kubernetes."""
 
     coordinator: str | None = None  # HOST:PORT of process 0
     processes: int | None = None

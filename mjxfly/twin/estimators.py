@@ -97,7 +97,7 @@ class Kalman:
         self._take(shared @ np.linalg.inv(shared[rows] + np.diag(noise)), error, shared)
 
     def correct_one(self, row: np.ndarray, error: float, deviation: float) -> None:
-        """Take one number: measured less predicted, its derivatives `row` (9,) by the state, its `deviation`."""
+        """Take one number: measured minus predicted, its derivatives `row` (9,) by the state, its `deviation`."""
         shared = (self.covariance @ row)[:, None]
         self._take(shared / (float(row @ shared[:, 0]) + deviation**2), np.array([error]), shared)
 
