@@ -111,7 +111,7 @@ class ImuWatch:
     def update(
         self, time: float, force: Sequence[float], position: np.ndarray, quaternion: np.ndarray, fresh: bool = True
     ) -> str:
-        """The contradiction between measured motion and IMU, empty if there is none; `time` [s] of the firmware's clock.
+        """Contradiction of measured motion and IMU, empty if there is none; `time` [s] of the firmware's clock.
 
         `force` (3,) [m/s2] is the accelerometer's; `position` (3,) [m] and `quaternion` (4,) repeat unless `fresh`.
         """

@@ -40,7 +40,7 @@ def unit_model(config: Config) -> AssemblyModel:
 
 
 class TeamModel(NamedTuple):
-    """Knowledge of a follower's controller about its team, in its mount frame; the axis F is absent for one follower."""
+    """Knowledge of a follower about its team, in its mount frame; the axis F is absent for one follower."""
 
     ratio: float  # N / (N - 1)
     # (F, 2) roll and pitch commands of all drones that balance the torque of lifting 1 m/s2 more than the leader

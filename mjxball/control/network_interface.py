@@ -53,7 +53,7 @@ class NetworkInterface(NamedTuple):
         return OBSERVATION_SIZE + self.history.size + (SATURATED if self.units else 0) + self._geometry_size
 
     def mask(self, ignore_position: bool) -> list[float]:
-        """1 for each component of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
+        """1 for components of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
         shown = self.history.mask(ignore_position)
         return shown + [1.0] * (self.input_size + self.units - len(shown))
 
