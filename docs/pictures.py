@@ -34,8 +34,8 @@ from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
 from mjxball.policy.file import policy_path, shipped_policy
 from mjxfly.log import result_of, without_goal
+from mjxfly.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
 from mjxfly.recording import read_recording
-from mjxfly.rig.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
 
 REPOSITORY = Path(__file__).parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

@@ -1,6 +1,6 @@
 """Firmware parameters that a file may set on the drones, and checks of its gains.
 
-Gains are checked by the margins of the pair's attitude loop (`control.margins`), with the gains of one drone on both.
+Gains are checked by the margins of the pair's attitude loop (`margins`), with the gains of one drone on both.
 The loop must be stable with a margin, and about as fast as the one that the policy was trained on.
 """
 
@@ -16,8 +16,8 @@ from mjxball.control.crazyflie import PARAMETERS, PairGains, pair_gains, with_ga
 from mjxball.errors import InputError
 from mjxball.reading import near
 from mjxfly.limits import NAMES
+from mjxfly.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxfly.policy_setup import is_crazyflie, with_curve
-from mjxfly.rig.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxfly.setpoints import CurveName
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters

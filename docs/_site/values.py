@@ -32,9 +32,9 @@ from mjxball.policy.formats.c_header import weight_bytes  # noqa: E402
 from mjxball.sim import disturbances  # noqa: E402
 from mjxball.sim.rigs import HELD_OUT_RIGS  # noqa: E402
 from mjxfly.limits import Limits, Times  # noqa: E402
+from mjxfly.margins import REQUIREMENTS  # noqa: E402
 from mjxfly.mocap_supervision import MocapLimits  # noqa: E402
 from mjxfly.preflight import Preflight  # noqa: E402
-from mjxfly.rig.margins import REQUIREMENTS  # noqa: E402
 from mjxfly.twin.conditions import Battery  # noqa: E402
 from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
 

@@ -19,7 +19,7 @@ def parser() -> cli.Parser:
         description="Fly followers on a CPU and measure them. Without a command: fly, whose flags are listed here.",
         usage="%(prog)s [COMMAND] [POLICY.npz ...] [--flag ...]",
         epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios. "
-        "Logs of real flights: python -m mjxfly.log.",
+        "Logs of real flights: docs/flight-log.md.",
     )
     commands = result.add_subparsers(
         title="commands", dest="command", metavar="COMMAND", prog=result.prog, parser_class=cli.Command

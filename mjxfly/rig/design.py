@@ -14,7 +14,7 @@ from mjxball.errors import InputError
 from mjxball.files import write_atomically
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.terminal import say
-from mjxfly.rig.margins import unstable_axes
+from mjxfly.margins import unstable_axes
 
 # Unit vectors 30 degrees apart; the opposite directions are covered because `largest_amplitude` tests both signs.
 DIRECTIONS = tuple((math.cos(turn * math.pi / 6), math.sin(turn * math.pi / 6)) for turn in range(6))

@@ -12,7 +12,7 @@ from mjxball import cli, config
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
-from mjxfly.rig.margins import (
+from mjxfly.margins import (
     REQUIREMENTS,
     AxisDesign,
     Gains,

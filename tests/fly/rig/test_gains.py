@@ -15,9 +15,7 @@ from mjxball.cli import read_plant
 from mjxball.config import Autopilot, apply_overrides, preset, with_plant
 from mjxball.control.axes import axes
 from mjxball.errors import InputError
-from mjxfly.preflight import read_gains
-from mjxfly.rig import gains as command
-from mjxfly.rig.margins import (
+from mjxfly.margins import (
     REQUIREMENTS,
     Gains,
     delivered_gains,
@@ -27,6 +25,8 @@ from mjxfly.rig.margins import (
     margins,
     worst_margins,
 )
+from mjxfly.preflight import read_gains
+from mjxfly.rig import gains as command
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)
