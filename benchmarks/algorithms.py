@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import Row, arguments, medians, say, table, write
-from mjxball.cli import run_command
+from mjxball.running import run_command
 from training import BAR, evaluate, launch, until_policy
 
 SHORT = {

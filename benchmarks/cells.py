@@ -29,11 +29,11 @@ from batch import fly_compiled
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
 from mjxball.bench.success import BOUNDS, Bound, limits
-from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
 from mjxball.evaluate.policies import load_policy
+from mjxball.running import run_command
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 

@@ -21,7 +21,6 @@ import numpy as np
 
 from harness import Row, arguments, table, write
 from mjxball.baselines import make_baseline
-from mjxball.cli import run_command
 from mjxball.config import Config, ball_limit, preset
 from mjxball.control import rotations
 from mjxball.control.followers import Follower
@@ -30,6 +29,7 @@ from mjxball.env import TransportEnv
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.inference import NetworkController, Policy
+from mjxball.running import run_command
 from mjxball.sim.rollout import make_privileged_info, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache

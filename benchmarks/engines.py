@@ -17,11 +17,11 @@ import jax
 import numpy as np
 
 from harness import Row, arguments, say, write
-from mjxball.cli import run_command
 from mjxball.config import Attitude, Drone, Motion, Plant, preset
 from mjxball.physics import mjx, motion, mujoco, newton_euler
 from mjxball.physics.engine import Load, PathShape, PlantState, Wrench, total_wrench
 from mjxball.plant import PlantParameters, plant_parameters
+from mjxball.running import run_command
 
 TIMES = (0.0, 2.0, 3.0, 7.0, 12.0, 19.0)
 WAVEFORM = Motion(kind="waveform", times=TIMES, offsets=(0.0, 0.03, -0.02, 0.04, -0.03, 0.0))

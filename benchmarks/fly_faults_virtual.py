@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from harness import Row, arguments, table, write
-from mjxball.cli import run_command
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
+from mjxball.running import run_command
 from mjxfly.app.host import Library, compile_pair
 from mjxfly.controller import FlightController
 from mjxfly.figures import SETTLING

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from batch import fly_compiled
 from harness import Row, arguments, say, write
-from mjxball import cli
+from mjxball import cli, running
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.evaluate.metrics import Metrics
@@ -115,4 +115,4 @@ def is_steady(metrics: Metrics, start: Metrics) -> bool:
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main))
+    raise SystemExit(running.run_command(main))

@@ -24,12 +24,12 @@ from typing import NamedTuple
 import numpy as np
 
 from harness import Row, arguments, say, table, write
-from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.file import interface_of, load_file, shipped_policies, shipped_policy
 from mjxball.policy.formats.c_header import APP, c_header, footprint
+from mjxball.running import run_command
 from mjxfly.app.generate import CORE, options, rig_header, sources
 from mjxfly.policy_setup import config_of
 

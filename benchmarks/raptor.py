@@ -26,7 +26,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjxball import cli
+from mjxball import cli, running
 from mjxball.bench import NAME, VERSION
 from mjxball.bench.entry import CONDITIONS, table
 from mjxball.bench.references import bars
@@ -143,4 +143,4 @@ def _rotor_step(config: Config) -> PlantStep:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run_command(main))
+    sys.exit(running.run_command(main))

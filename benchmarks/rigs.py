@@ -30,7 +30,6 @@ from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
 from mjxball.bench.success import Bound, limits, numbers
 from mjxball.bench.tracks import RIG_LENGTH
-from mjxball.cli import run_command
 from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Controller, Copy
 from mjxball.errors import InputError
@@ -38,6 +37,7 @@ from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import flies_any_rig, load_policy
 from mjxball.policy import Policy
 from mjxball.policy.inference import NetworkController
+from mjxball.running import run_command
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, rig_config, sample_rigs, unpadded
 from random_rigs import AnyRigController, fly, rig_controllers
 from teams import effort_of

@@ -44,7 +44,6 @@ from mjxball.baselines import CONTROLLERS, make_baseline
 from mjxball.bench.scores import by_variant, fly_suites
 from mjxball.bench.success import Bound, limits
 from mjxball.bench.suites import Suite, Variant
-from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.network import Network
 from mjxball.errors import InputError
@@ -54,6 +53,7 @@ from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.inference import NetworkController
 from mjxball.reading import parse_json
+from mjxball.running import run_command
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 

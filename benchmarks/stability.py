@@ -32,7 +32,6 @@ from batch import controller_of, fly_compiled
 from harness import Row, arguments, say, table, write
 from mjxball.arrays import Array
 from mjxball.baselines import make_baseline
-from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control import rotations
 from mjxball.control.constants import trim_limit
@@ -41,6 +40,7 @@ from mjxball.evaluate.policies import load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import jax_repeat, make_plant_step, start_state
+from mjxball.running import run_command
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, SensorState

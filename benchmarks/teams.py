@@ -18,7 +18,7 @@ import numpy as np
 
 from batch import fly_compiled
 from harness import Row, arguments, say, write
-from mjxball import cli
+from mjxball import running
 from mjxball.baselines import make_baseline
 from mjxball.bench.success import Bound, limits
 from mjxball.config import Config, preset
@@ -123,4 +123,4 @@ def _trimmed(config: Config, mass: float) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run_command(main))
+    sys.exit(running.run_command(main))

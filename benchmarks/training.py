@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import ROOT, Row, arguments, medians, say, table, write
-from mjxball.cli import run_command
+from mjxball.running import run_command
 
 BAR = {"x_peak": 0.02, "settling_time": 3.5, "rmse": 0.35}
 NO_CACHE = Path("off")  # what MJXBALL_CACHE takes for none

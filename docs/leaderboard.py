@@ -14,8 +14,8 @@ from typing import Any
 
 from mjxball.bench.entry import CONDITIONS, cells, read_entry
 from mjxball.bench.tracks import TRACKS
-from mjxball.cli import run_command
 from mjxball.errors import InputError
+from mjxball.running import run_command
 
 ENTRIES = Path(__file__).parents[1] / "benchmarks" / "leaderboard"
 COLUMNS = (

@@ -13,10 +13,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt, run_command
+from mjxball.cli import make_parser, output_file, plant_setup
 from mjxball.config import Attitude, Plant
 from mjxball.files import write_atomically
 from mjxball.plant import ROLLING_INERTIA, plant_parameters, rotors
+from mjxball.running import quit_on_interrupt, run_command
 
 ASSEMBLY = "assembly"
 LEADER = "leader"

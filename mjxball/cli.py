@@ -1,16 +1,13 @@
-"""Shared by all command lines: parser, exit codes, output paths, and flags generated from the configuration."""
+"""Shared by all command lines: parser, output paths, and flags generated from the configuration."""
 
 from __future__ import annotations
 
 import argparse
-import atexit
 import contextlib
 import difflib
-import gc
 import itertools
 import os
 import re
-import signal
 import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -21,13 +18,9 @@ from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
 from mjxball.reading import MAX_SIZE, MIN_SIZE, is_number, shown
+from mjxball.running import run_command
 from mjxball.terminal import sentence, warn
-from mjxball.xla import explained
 
-FAULT = 3  # exit code after a defect of the program; 1 says that a check failed
-# The extra that installs a package, if it is not `train`.
-EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "osqp": "mpc"}
-EXTRAS |= dict.fromkeys(("cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
 SHELLS = ("bash", "zsh", "tcsh")
 Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 
@@ -204,62 +197,6 @@ def make_parser(
         about = f"print what makes {', '.join(SHELLS)} complete this command, and exit"
         parser.add_argument("--print-completion", action=Completion, choices=SHELLS, metavar="SHELL", help=about)
     return parser
-
-
-def quit_on_interrupt() -> None:
-    """Make Ctrl-C end the process at once, without output, code 130; an interrupted import can abort Python."""
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-
-
-def collect_seldom() -> None:
-    """Collect garbage less often: tracing makes millions of lasting objects, which every collection visits.
-
-    Python's default costs a tenth of the time of a short training, and 0.7 s at the end of the process.
-    """
-    gc.set_threshold(100_000, 50, 100)
-    atexit.register(gc.freeze)
-
-
-def switch_often() -> None:
-    """Switch threads every 0.5 ms instead of 5: the training thread waits whenever another thread imports."""
-    sys.setswitchinterval(5e-4)
-
-
-def run_command(command: Callable[[], int]) -> int:
-    """Run `command`. Bad input, a failing file or a missing package is one line on stderr and exit code 2."""
-    try:
-        code = command()
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        return code
-    except InputError as error:
-        warn(sentence(f"error: {error}"))
-        return 2
-    except OSError as error:
-        where = error.filename or "standard output or a file"
-        _discard_stdout()
-        warn(f"error: {where}: {error.strerror or error}")
-        return 2
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("mjx"):  # a defect of this distribution
-            raise
-        extra = EXTRAS.get(error.name or "", "train")
-        warn(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'")
-        return 2
-    except (MemoryError, RuntimeError, AssertionError) as error:
-        why = explained(error)
-        if why is None:
-            raise
-        warn(f"error: {why}")
-        return 2
-
-
-def _discard_stdout() -> None:
-    """Redirect stdout if it cannot be written; Python would try again at exit and print its own error."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def output_directory(path: Path, but: Sequence[str] = ()) -> Path:

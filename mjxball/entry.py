@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import traceback
 
-from mjxball.cli import FAULT, collect_seldom, quit_on_interrupt, run_command, switch_often
+from mjxball.running import FAULT, collect_seldom, quit_on_interrupt, run_command, switch_often
 
 
 def train() -> int:

@@ -12,11 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mjxball import config as configs
-from mjxball.cli import Parser, make_parser, output_file, plant_setup, quit_on_interrupt, run_command
+from mjxball.cli import Parser, make_parser, output_file, plant_setup
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
 from mjxball.policy import team
 from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
+from mjxball.running import quit_on_interrupt, run_command
 
 
 def policy_of_run(run: Path) -> PolicyFile:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjxball import cli
+from mjxball import cli, running
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     about = "of figures: screen (default), or paper: PDF of a column's width"
     parser.add_argument("--style", choices=STYLES, default="screen", help=about)
     options = parser.parse_args(arguments)
-    return cli.run_command(lambda: _plot_or_export(options))
+    return running.run_command(lambda: _plot_or_export(options))
 
 
 def _plot_or_export(options: argparse.Namespace) -> int:
@@ -165,5 +165,5 @@ def _cut(result: Result, rows: int) -> Result:
 
 
 if __name__ == "__main__":
-    cli.quit_on_interrupt()
+    running.quit_on_interrupt()
     sys.exit(main())

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mjxball import __version__, cli
+from mjxball import __version__, running
 from mjxball.config import to_dict
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
@@ -185,7 +185,7 @@ WRITERS = {".mcap": write_mcap, ".csv": write_csv, ".parquet": write_parquet}
 
 def main() -> int:
     """Record log lines from standard input as MCAP to the file on standard output; return the exit code."""
-    return cli.run_command(_record)
+    return running.run_command(_record)
 
 
 def _record() -> int:

@@ -13,12 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from mjxball import cli, terminal
-from mjxball.cli import run_command
 from mjxball.config import Config
 from mjxball.control.crazyflie import PairGains
 from mjxball.errors import InputError
 from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
+from mjxball.running import run_command
 from mjxfly import app_flight, clock, limits
 from mjxfly.app import generate
 from mjxfly.controller import FlightController

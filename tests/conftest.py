@@ -24,8 +24,8 @@ import pytest
 import short_train
 from command_line import HASTY
 
-from mjxball import cli, xla
 from mjxball import config as configs
+from mjxball import running, xla
 from mjxball.algorithms import sac
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.algorithms.gradient import FirstOrderGradient
@@ -44,7 +44,7 @@ if xla.VARIABLE not in os.environ:  # one compilation cache a run: of its worker
     atexit.register(shutil.rmtree, os.environ[xla.VARIABLE], ignore_errors=True)
 xla.enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # tests share hundreds of tiny programs
-cli.collect_seldom()  # as the commands do
+running.collect_seldom()  # as the commands do
 
 # Derandomised: the same examples on every machine, so that a red build is never a matter of luck.
 hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import sys
 
-from mjxball.cli import quit_on_interrupt
 from mjxball.commands import compare, train
 from mjxball.config import Config
 from mjxball.evaluate.scenarios import standard_scenarios
+from mjxball.running import quit_on_interrupt
 from mjxball.sim.scenario import Scenario
 from mjxball.train import processes
 

@@ -23,7 +23,8 @@ FLOORS = (
     {"files"},
     {"config"},
     {"xla", "scalar_form"},
-    {"cli", "quiet", "plotting"},
+    {"running", "quiet", "plotting"},
+    {"cli"},
     {"plant"},
     {"control"},
     {"policy", "baselines"},
@@ -55,7 +56,20 @@ GROUND = {
     "control",
 }  # all of our own that `control` and `policy` may import
 # What the base install runs: NumPy alone.
-BASE = ("arrays", "errors", "reading", "pictures", "files", "config", "cli", "plant", "control", "policy", "entry")
+BASE = (
+    "arrays",
+    "errors",
+    "reading",
+    "pictures",
+    "files",
+    "config",
+    "running",
+    "cli",
+    "plant",
+    "control",
+    "policy",
+    "entry",
+)
 OURS, FLIES = "mjxball", "mjxfly"
 # What only flights need, their logs and their cameras.
 FLYING = {"cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"}

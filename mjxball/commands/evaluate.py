@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 
-from mjxball import cli
+from mjxball import cli, running
 from mjxball.commands import bench, figures, fly, suites
 
 COMMANDS = {"fly": fly, "suites": suites, "bench": bench, "figures": figures}
@@ -37,4 +37,4 @@ def main(arguments: list[str] | None = None) -> int:
     named = given and (given[0] in COMMANDS or given[0].partition("=")[0] in WHOLE)
     options = parser().parse_args(given if named else ["fly", *given])
     command = shlex.join(["python", "eval.py", *given])
-    return cli.run_command(lambda: COMMANDS[options.command].run(options, command))
+    return running.run_command(lambda: COMMANDS[options.command].run(options, command))

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball import cli, config
+from mjxball import cli, config, running
 from mjxball.algorithms import ALGORITHMS
 from mjxball.commands.compare import compare, compare_members, compile_ahead, is_evaluated
 from mjxball.commands.new_run import (
@@ -124,7 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Train, export, evaluate; return the exit code."""
     options = parser().parse_args(arguments)
     command = shlex.join(["python", "train.py", *(sys.argv[1:] if arguments is None else arguments)])
-    return cli.run_command(lambda: _train(options, command))
+    return running.run_command(lambda: _train(options, command))
 
 
 def _train(options: argparse.Namespace, command: str) -> int:

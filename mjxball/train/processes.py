@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.cli import FAULT
 from mjxball.errors import InputError, TrainingDivergedError
+from mjxball.running import FAULT
 from mjxball.terminal import warn
 from mjxball.train import lock
 

@@ -9,9 +9,10 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mjxball.cli import Parser, make_parser, output_file, run_command
+from mjxball.cli import Parser, make_parser, output_file
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
+from mjxball.running import run_command
 from mjxball.view.flight import Flight, flight_from, save_flight
 from mjxball.view.page import flight_page
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mjxball.cli import make_parser, plant_setup, run_command
+from mjxball.cli import make_parser, plant_setup
 from mjxball.errors import InputError
 from mjxball.export import add_source, contents_of, in_team
 from mjxball.policy import team
+from mjxball.running import run_command
 from mjxfly.app.generate import check_place, write_app
 
 

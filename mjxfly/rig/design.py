@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjxball import cli, pictures
+from mjxball import cli, pictures, running
 from mjxball.config import Config, cg_limit, thrust_over_weight, total_mass
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
@@ -33,7 +33,7 @@ def parser() -> cli.Parser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the report and write the plan; return the exit code, 1 if the rig cannot balance its own object."""
     options = parser().parse_args(arguments)
-    return cli.run_command(lambda: _design(options))
+    return running.run_command(lambda: _design(options))
 
 
 def _design(options: argparse.Namespace) -> int:

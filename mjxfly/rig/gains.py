@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjxball import cli, config
+from mjxball import cli, config, running
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
@@ -40,7 +40,7 @@ def parser() -> cli.Parser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Design the gains, print them with their margins, write the file; return the exit code."""
     options = parser().parse_args(arguments)
-    return cli.run_command(lambda: _gains(options))
+    return running.run_command(lambda: _gains(options))
 
 
 def _gains(options: argparse.Namespace) -> int:

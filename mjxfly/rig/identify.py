@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball import cli, config
+from mjxball import cli, config, running
 from mjxball.control import crazyflie
 from mjxball.control.axes import inertia_about_o
 from mjxball.control.constants import hover
@@ -49,7 +49,7 @@ def parser() -> cli.Parser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Identify the plant, print the estimates, write the plant file; return the exit code."""
     options = parser().parse_args(arguments)
-    return cli.run_command(lambda: _identify(options))
+    return running.run_command(lambda: _identify(options))
 
 
 def _identify(options: argparse.Namespace) -> int:

@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.cli import make_parser, run_command
+from mjxball.cli import make_parser
 from mjxball.errors import InputError
+from mjxball.running import run_command
 from mjxball.terminal import say
 from mjxfly import clock
 from mjxfly.app.host import compile_pair

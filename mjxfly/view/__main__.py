@@ -2,7 +2,7 @@
 
 import sys
 
-from mjxball.cli import quit_on_interrupt
+from mjxball.running import quit_on_interrupt
 from mjxfly.view.main import main
 
 if __name__ == "__main__":

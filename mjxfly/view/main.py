@@ -6,8 +6,9 @@ import argparse
 import functools
 from pathlib import Path
 
-from mjxball.cli import Parser, run_command
+from mjxball.cli import Parser
 from mjxball.errors import InputError
+from mjxball.running import run_command
 from mjxball.view.flight import flight_from
 from mjxball.view.main import make_view_parser, show
 from mjxfly.view.live import follow

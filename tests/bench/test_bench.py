@@ -18,11 +18,11 @@ from mjxball.baselines import make_baseline
 from mjxball.bench import followers, references, success
 from mjxball.bench.entry import CONDITIONS, read_entry, run
 from mjxball.bench.tracks import MARGIN, TRACKS, World, worlds_of
-from mjxball.cli import run_command
 from mjxball.commands.evaluate import main
 from mjxball.evaluate.metrics import measure
 from mjxball.export import main as export
 from mjxball.plant.trim import largest_margin
+from mjxball.running import run_command
 from mjxball.sim.rollout import simulate
 
 BALANCE = REPOSITORY / "policies" / "balance.npz"

@@ -214,11 +214,11 @@ def test_without_a_coordinator_it_says_what_it_found(variables, words, tmp_path:
 
 MEET = """
 import sys
-from mjxball import cli
+from mjxball import running
 from mjxball.train import processes
-cli.quit_on_interrupt()
+running.quit_on_interrupt()
 processes.PATIENCE = {patience}
-sys.exit(cli.run_command(lambda: processes.join(processes.Rendezvous({place!r}, 2, {process}))))
+sys.exit(running.run_command(lambda: processes.join(processes.Rendezvous({place!r}, 2, {process}))))
 """
 
 

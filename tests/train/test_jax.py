@@ -16,8 +16,8 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, PartitionSpec
 from tables import weekly
 
-from mjxball import cli, entry
 from mjxball import config as configs
+from mjxball import entry, running
 from mjxball.config import Config
 from mjxball.train import compilation, train
 from mjxball.xla import enable_compilation_cache
@@ -77,7 +77,7 @@ def test_an_error_of_the_program_is_no_result(monkeypatch: pytest.MonkeyPatch, c
         monkeypatch.setattr(f"mjxball.commands.{name}.main", fail)
         for later in ("quit_on_interrupt", "collect_seldom", "switch_often"):
             monkeypatch.setattr(entry, later, lambda: None)
-        assert command() == cli.FAULT == 3
+        assert command() == running.FAULT == 3
         assert "not the user's fault" in capsys.readouterr().err  # with its traceback
 
 
