@@ -141,8 +141,8 @@ class EnvironmentBatch(Protocol):
         """The same environments, with the step of a single one batched by `transform`, such as `jax.vmap`."""
         ...
 
-    def sampled(self, envs: Any, key: Array) -> Any:
-        """Sampled initial states, one for each of `envs`, to pass to `step`."""
+    def reset(self, key: Array) -> Any:
+        """Sampled initial states of all environments, which `step` takes for those that ended."""
         ...
 
     def step(
@@ -150,7 +150,7 @@ class EnvironmentBatch(Protocol):
     ) -> tuple[Any, Transition]:
         """Step `envs` with `action`, then reset those whose episode ended.
 
-        Initial states are sampled with `key`, or taken from `fresh` (of `sampled`), which avoids it at every step.
+        Initial states are sampled with `key`, or taken from `fresh` (of `reset`), which avoids it at every step.
         With neither, ended episodes go on.
         """
         ...

@@ -85,7 +85,7 @@ class ProximalPolicyOptimization:
 
     def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: TrainingPhase) -> tuple[PpoState, Any]:
         """`steps_per_collect` steps of all environments, whose observations update the normaliser."""
-        act_keys, fresh = jax.random.split(keys[0], self.steps_per_collect), self._environments.sampled(envs, keys[1])
+        act_keys, fresh = jax.random.split(keys[0], self.steps_per_collect), self._environments.reset(keys[1])
         distribution = self.networks.parametric_action_distribution
 
         def step(envs: Any, key: Array) -> tuple[Any, Any]:

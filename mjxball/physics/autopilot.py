@@ -33,7 +33,7 @@ def rotor_targets(
         commands,
         euler[..., None, :],
         state.rates[..., None, :],
-        carried_mass(parameters, state, believed_mass),
+        carried_mass(parameters, believed_mass),
         parameters.gains,
         parameters.gravity,
         parameters.arm,
@@ -44,9 +44,9 @@ def rotor_targets(
     )
 
 
-def carried_mass(parameters: PlantParameters, state: PlantState, believed_mass: Scalar) -> Float[Array, "... drones"]:
+def carried_mass(parameters: PlantParameters, believed_mass: Scalar) -> Float[Array, "... drones"]:
     """Mass that each drone's hover thrust assumes: itself and its shares of the carrier and of the object [kg]."""
-    xp, dtype = state.rates.__array_namespace__(), state.rates.dtype
+    xp, dtype = believed_mass.__array_namespace__(), believed_mass.dtype
     own, share = (xp.asarray(value, dtype=dtype) for value in (parameters.known_mass, parameters.load_share))
     return own + share * believed_mass[..., None]
 
@@ -72,7 +72,7 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
             zero = commands[..., 0, 0] * 0.0
             return with_battery(state, commands, load._replace(battery=zero + motors.USUAL_BATTERY, uncompensated=zero))
         xp, autopilot, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
-        sent = crazyflie.setpoints(autopilot, commands, carried_mass(constants, state, load.believed_mass), gravity)
+        sent = crazyflie.setpoints(autopilot, commands, carried_mass(constants, load.believed_mass), gravity)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
@@ -99,7 +99,7 @@ def make_battery_autopilot(config: Config, parameters: PlantParameters | None = 
         state: PlantState, commands: Float[Array, "... drones 3"], load: Load
     ) -> tuple[Float[Array, "... drones 13"], Float[Array, "... drones 4"]]:
         xp = commands.__array_namespace__()
-        carried = carried_mass(constants, state, load.believed_mass)
+        carried = carried_mass(constants, load.believed_mass)
         uncompensated: Array = load.uncompensated
         volts: Array = load.battery
         old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]

@@ -16,7 +16,7 @@ from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import motion
-from mjxball.physics.autopilot import Autopilot, make_autopilot
+from mjxball.physics.autopilot import Autopilot, carried_mass, make_autopilot
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench, total_wrench
 from mjxball.plant import PlantParameters, plant_parameters
 
@@ -161,8 +161,7 @@ def hover_rotor_force(
     """Rotor forces [N] that hover with an object of `believed_mass` [kg] and the CG at O."""
     xp = believed_mass.__array_namespace__()
     params = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (params.known_mass, params.load_share))
-    per_rotor = (own + share * believed_mass[..., None]) * params.gravity / 4
+    per_rotor = carried_mass(params, believed_mass) * params.gravity / 4
     per_rotor = clipped(per_rotor, 0.0, params.rotor_force_max)
     return xp.stack([per_rotor] * 4, axis=-1)
 

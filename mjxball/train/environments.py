@@ -159,17 +159,13 @@ class Environments:
         other._step = transform(self.env.step)
         return other
 
-    def sampled(self, envs: Envs, key: Array) -> Any:
-        """See `mjxball.algorithms.base.EnvironmentBatch`."""
-        return self.reset(key)
-
     def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
         """See `mjxball.algorithms.base.EnvironmentBatch`."""
         done = envs.states.done.astype(bool)
         ended = done if others is None else done | others
 
         def reset_ended(before: Any) -> Any:
-            return self._mixed(ended, self.sampled(envs, key), before)
+            return self._mixed(ended, self.reset(key), before)
 
         if jax.default_backend() != "cpu":  # on a GPU the host would wait for the condition
             return envs._replace(states=reset_ended(envs.states))
