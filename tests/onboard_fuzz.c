@@ -91,7 +91,7 @@ static void hear(void) {
     const int size = once_in(rate.beats) ? (int)below(MTU) : MJXBALL_BEAT_SIZE;
     uint8_t full[MTU] = {'M', !MJXBALL_FOLLOWER, app.phase, 1};
     for (int k = 0; k < 9; k++) numbers[k] = noise(0.02f);
-    numbers[3] = noise(most_turn());
+    numbers[3] = noise(tilt_integral_limit());
     wilden(numbers, 9, rate.beats);
     copy(full + 4, &mjxball_rig.key, 4);
     copy(full + 8, numbers, sizeof numbers);

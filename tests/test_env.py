@@ -161,7 +161,7 @@ def test_diverged_world_is_ended_counted_and_left_finite(pair: CompiledEnv, dama
     after = pair.step(damage(before), jnp.zeros(3))
     assert float(after.metrics["diverged"]) == 1.0
     assert (float(after.done), float(after.info["truncation"])) == (1.0, 0.0)
-    assert finite((after.obs, after.reward, after.metrics, after.pipeline_state.plant, after.pipeline_state.history))
+    assert finite((after.obs, after.reward, after.metrics, after.pipeline_state.plant, after.pipeline_state.memory))
     sound = pair.step(before, jnp.zeros(3))
     assert (float(sound.metrics["diverged"]), float(sound.done)) == (0.0, 0.0)
 

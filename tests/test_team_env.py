@@ -81,7 +81,7 @@ class TestRings:
         alone = TransportEnv(own, "newton-euler")
         plant = world.plant._replace(rotor_force=world.plant.rotor_force[:3])
         still = jnp.zeros((2, 3))
-        other = world._replace(loop=world.loop._replace(plant=plant), action=still, command=still, rig=())
+        other = world._replace(loop=world.loop._replace(plant=plant), action=still, command=still, parameters=())
         action = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (5, 3)), jnp.float32)
         for _ in range(5):
             state = jax.jit(env.step)(state, action)

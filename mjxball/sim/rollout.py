@@ -49,10 +49,10 @@ class Carry(NamedTuple):
 class Inputs(NamedTuple):
     """Goals and disturbances of n flights in a control step, or with a leading axis in each of T."""
 
-    time: Float[Array, ""]  # at the beginning [s]
-    goal: Float[Array, "n 3"]  # of O at the beginning [m]
-    next_goal: Float[Array, "n 3"]  # of O at the end [m]
-    force: Float[Array, "n 3"] | None  # external force on O meanwhile [N]; None: none
+    time: Float[Array, "..."]  # at the beginning [s]
+    goal: Float[Array, "... n 3"]  # of O at the beginning [m]
+    next_goal: Float[Array, "... n 3"]  # of O at the end [m]
+    force: Float[Array, "... n 3"] | None  # external force on O meanwhile [N]; None: none
     sample: Sample  # disturbances of the measurement at the end
 
     def at(self, number: int) -> Inputs:

@@ -30,7 +30,7 @@ TRAIN = shlex.join([sys.executable, "tests/short_train.py"])
 FIRST_EVALUATION = 2 * STEPS  # after which the run would save by itself
 MEMBERS = [*tiny(sac__total_steps=2 * FIRST_EVALUATION, sac__num_evaluations=2), "--num-seeds", "2"]
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.release]
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,6 @@ def test_preempted_and_requeued_job_resumes_to_the_same_bits(cluster: Cluster, w
     assert_same_policies(run, whole)
 
 
-@pytest.mark.release
 def test_job_array_trains_a_population_in_parts(cluster: Cluster, tmp_path: Path) -> None:
     """Brought together its members are those of one run, to the last bit."""
     sweep = tmp_path / "sweep.json"
@@ -124,7 +123,6 @@ def test_job_array_trains_a_population_in_parts(cluster: Cluster, tmp_path: Path
     assert_same_policies(gathered, whole)
 
 
-@pytest.mark.release
 def test_mpirun_trains_and_resumes_to_the_same_bits(whole: Path, tmp_path: Path) -> None:
     """SIGTERM reaches process 0, whose number is in the lock."""
     if shutil.which("mpirun") is None:

@@ -38,7 +38,7 @@ for algorithm in ALGORITHMS:
         assert population.devices == jax.local_device_count() == 2
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
-        for mode in (programs.warmup, programs.train, programs.train, programs.evaluate):
+        for mode in (programs.warmup_mode, programs.train_mode, programs.train_mode, programs.evaluate_mode):
             state, *_ = population.advance(compiled, state, mode(20))
         floats = [leaf for leaf in jax.tree.leaves(state.algorithm) if leaf.dtype == np.float32]
         assert all(len(leaf.sharding.device_set) == 2 for leaf in floats)
