@@ -169,7 +169,7 @@ def test_formulas_are_the_browsers_own(site: Path) -> None:
 def test_the_reference_states_shapes_and_units(site: Path) -> None:
     """Shapes in signatures and comments beside fields come through, and so does every setting."""
     flights = html.unescape(re.sub(r"<[^>]+>", "", (site / "reference" / "flights.html").read_text()))
-    assert "position: Float[Array, 'T ... 3']" in flights.replace("…", "...")
+    assert "position: Float[Array, '... 3']" in flights.replace("…", "...")
     assert re.search(r"position:? *(?:– |— )?of O in the world \[m\]", flights)
     settings = (site / "reference" / "settings.html").read_text()
     for flag in ("--plant.object_mass", "--sac.total_steps", "--reward.error_scale"):

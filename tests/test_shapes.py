@@ -54,8 +54,10 @@ def verify(value: Any, hint: Any, where: str) -> None:
             raise TypeError(f"{where} is {told(value)}, not {hint.__name__}")
     elif hasattr(hint, "_fields") and isinstance(value, hint):
         hints = typing.get_type_hints(hint)
+        absent = {name for name, default in hint._field_defaults.items() if default is None}
         for name in hint._fields:
-            verify(getattr(value, name), hints[name], f"{where}.{name}")
+            if not (name in absent and getattr(value, name) is None):
+                verify(getattr(value, name), hints[name], f"{where}.{name}")
 
 
 def told(value: Any) -> str:

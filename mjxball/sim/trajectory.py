@@ -30,22 +30,22 @@ class Trajectory(NamedTuple):
     any bound, or a value that is not finite) stays as it was before. `simulate` gives NumPy float64 and all fields.
     """
 
-    time: Float[Array, " T"]  # [s]
-    position: Float[Array, "T ... 3"]  # of O in the world [m]
-    velocity: Float[Array, "T ... 3"]  # of O in the world [m/s]
-    euler: Float[Array, "T ... 3"]  # roll, pitch, yaw [rad]
-    rates: Float[Array, "T ... 3"]  # body rates [rad/s]
-    quaternion: Float[Array, "T ... 4"]  # body -> world (w, x, y, z)
-    rotor_force: Float[Array, "T ... drones 4"]  # [N]
-    leader_command: Float[Array, "T ... 3"]  # roll, pitch [rad], vertical acceleration [m/s2], in body axes
-    follower_command: Float[Array, "T ... 3"]  # likewise
-    target: Float[Array, "T ... 3"]  # goal of O [m]
-    diverged: Bool[Array, "T ..."]  # whether the flight has diverged by then
-    observation: Float[Array, "T ... 18"] = NOT_RECORDED  # what the followers saw, in their mount frames
-    cg_offset: Float[Array, "T ..."] = NOT_RECORDED  # along the load's directions from O [m]
-    object_mass: Float[Array, "T ..."] = NOT_RECORDED  # [kg]
-    contact_force: Float[Array, "T ... drones 3"] = NOT_RECORDED  # of every drone on the carrier, body axes [N]
-    contact_torque: Float[Array, "T ... drones 3"] = NOT_RECORDED  # likewise, about each drone's centre [N m]
+    time: Float[Array, "..."]  # [s]
+    position: Float[Array, "... 3"]  # of O in the world [m]
+    velocity: Float[Array, "... 3"]  # of O in the world [m/s]
+    euler: Float[Array, "... 3"]  # roll, pitch, yaw [rad]
+    rates: Float[Array, "... 3"]  # body rates [rad/s]
+    quaternion: Float[Array, "... 4"]  # body -> world (w, x, y, z)
+    rotor_force: Float[Array, "... drones 4"]  # [N]
+    leader_command: Float[Array, "... 3"]  # roll, pitch [rad], vertical acceleration [m/s2], in body axes
+    follower_command: Float[Array, "... 3"]  # likewise
+    target: Float[Array, "... 3"]  # goal of O [m]
+    diverged: Bool[Array, "..."]  # whether the flight has diverged by then
+    observation: Float[Array, "... 18"] = NOT_RECORDED  # what the followers saw, in their mount frames
+    cg_offset: Float[Array, "..."] = NOT_RECORDED  # along the load's directions from O [m]
+    object_mass: Float[Array, "..."] = NOT_RECORDED  # [kg]
+    contact_force: Float[Array, "... drones 3"] = NOT_RECORDED  # of every drone on the carrier, body axes [N]
+    contact_torque: Float[Array, "... drones 3"] = NOT_RECORDED  # likewise, about each drone's centre [N m]
 
     @classmethod
     def of(cls, plant: PlantState, time: Scalar, target: Vector, commands: TeamCommands, **others: Any) -> Trajectory:
