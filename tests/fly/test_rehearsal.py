@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, environment
 from conftest import too_busy
-from tables import weekly
 
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
@@ -136,7 +135,8 @@ def test_the_last_line_tells_where_the_object_is(name: str, flights: dict[str, E
     assert np.abs(np.array(told[0][:3], float) - moved).max() < 0.03  # the estimators' noise on a stand
 
 
-@pytest.mark.parametrize("onboard", [(), *weekly(("--onboard",))])
+@pytest.mark.release
+@pytest.mark.parametrize("onboard", [(), ("--onboard",)])
 def test_runner_watchdog_and_twin_share_a_slower_clock(onboard: tuple[str, ...], tmp_path: Path) -> None:
     if onboard and shutil.which("gcc") is None:
         pytest.skip("needs gcc")

@@ -14,6 +14,7 @@ from command_line import REPOSITORY, assert_refused, environment
 from mjxball.commands.train import main
 
 SHORT = ["paper", "--physics", "newton-euler", "--sac.total_steps", "4000", "--sac.warmup_steps", "1000"]
+SHORT += ["--sac.policy_layers", "16,16", "--sac.critic_layers", "16,16", "--sac.batch_size", "64"]
 SHORT += ["--sac.replay_size", "4000", "--out", "run"]
 RECIPES = dict(
     re.findall(
