@@ -295,7 +295,7 @@ def settings(program: Program, random: Random, count: int) -> Iterator[Case]:
     """Some of the configuration's flags with what no setting is."""
     leaves = random.sample([path for path, _, _ in configs.leaves(configs.Config())], count)
     for number, path in enumerate(leaves):
-        word = ("nan", "1e999", "-1e30", "abc", "1,2,3,4,5,6,7,8,9", "1e-320", "1e9", "1e300", "9" * 400)[number % 9]
+        word = ("nan", "1e999", "-1e30", "abc", "1,2,3,4,5,6,7,8,x", "1e-320", "1e13", "1e300", "9" * 400)[number % 9]
         yield _with(program, f"--{path}={_named(word)}", f"--{path}={word}")
     for flag in (
         "sac.learning_rate=1e-320",
