@@ -77,7 +77,7 @@ def medians(flown: list[Any], cells: int) -> list[Row]:
     return found
 
 
-def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Any]:
+def fly_cells(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Any]:
     """`medians` of a follower's flights."""
     return medians(fly_compiled(preset("paper"), follower, scenarios_of(cells, common, disturbed, seeds)), len(cells))
 
@@ -124,15 +124,15 @@ def evaluate(
     config: Config, policies: list[Follower], reference: str, cells: list[Cell], seeds: int
 ) -> tuple[list[Row], list[str]]:
     """(summaries, what is missed) of all policies in all four conditions."""
-    calm, summaries, missed = fly(make_baseline(reference, config), cells, {}, False, seeds), [], []
+    calm, summaries, missed = fly_cells(make_baseline(reference, config), cells, {}, False, seeds), [], []
     for known, disturbed in ((True, False), (True, True), (False, False), (False, True)):
         rival = "adaptive" if known else "adaptive-mass"
         common = {} if known else {"believed_mass": BELIEVED}
         where = condition(known, disturbed)
-        other = fly(make_baseline(rival, config), cells, common, disturbed, seeds)
+        other = fly_cells(make_baseline(rival, config), cells, common, disturbed, seeds)
         for policy in policies:
             rows = []
-            mine = fly(policy, cells, common, disturbed, seeds)
+            mine = fly_cells(policy, cells, common, disturbed, seeds)
             for cell, own, theirs, best in zip(cells, mine, other, calm, strict=True):
                 bar = wanted(theirs, best)
                 peaks = {"policy": own["peak"], rival: theirs["peak"], f"{reference}, undisturbed": best["peak"]}

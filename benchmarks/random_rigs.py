@@ -30,7 +30,7 @@ from mjxball.sim.rollout import Carry, Inputs, control_step
 SECONDS = 30.0  # of a flight
 
 
-def fly(
+def fly_random_rigs(
     config: Config,
     rigs: RigTable,
     controllers: Controller | Sequence[Controller],

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found: dict[str, Any] = {}
     for track in PAIRS:
         (world,) = worlds_of(track, options.draw)
-        flown = fly(world, Raptor())
+        flown = fly_world(world, Raptor())
         met = successes(flown, bars(track, options.draw, 0))
         # There is no attitude command whose change could be measured.
         found[track] = {
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def fly(world: World, raptor: Any) -> list[metrics.Metrics]:
+def fly_world(world: World, raptor: Any) -> list[metrics.Metrics]:
     """Metrics of every flight, undisturbed and disturbed in turn; `raptor` keeps a memory for each drone of each."""
     scenarios = [one for pair in world.scenarios for one in pair]
     plant = dataclasses.replace(world.config.plant, layout="x")

@@ -39,7 +39,7 @@ from mjxball.policy import Policy
 from mjxball.policy.inference import NetworkController
 from mjxball.running import run_command
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, rig_config, sample_rigs, unpadded
-from random_rigs import AnyRigController, fly, rig_controllers
+from random_rigs import AnyRigController, fly_random_rigs, rig_controllers
 from teams import effort_of
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
@@ -93,7 +93,7 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
         flown: dict[str, list[list[Metrics]]] = {}
         for name, make in followers(options.policies):
             begun = time.perf_counter()
-            flown[name] = fly(config, rigs, make(config, rigs), FLIGHTS)
+            flown[name] = fly_random_rigs(config, rigs, make(config, rigs), FLIGHTS)
             seconds = round(time.perf_counter() - begun, 1)
             # Rows of the two LQGs are complete once both have flown.
             for known in {KNOWING[0]: (), KNOWING[1]: KNOWING}.get(name, (name,)):

@@ -146,7 +146,7 @@ class Single(Stacked):
         return memory[0], command[0]
 
 
-def fly(config: Config, policies: list[Policy], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
+def fly_policies(config: Config, policies: list[Policy], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
     """Metrics of every policy in every scenario."""
     count = len(scenarios)
     flown = fly_compiled(config, policies[0], list(scenarios) * len(policies), controller=Stacked(policies))
@@ -172,7 +172,7 @@ def of_levels(config: Config, policies: list[Policy]) -> list[Row]:
                 scenarios.append(scenario)
     metrics: list[dict[Any, list[Metrics]]] = [{} for _ in policies]
     for own, names, scenarios in groups.values():
-        for found, flown in zip(metrics, fly(own, policies, scenarios), strict=True):
+        for found, flown in zip(metrics, fly_policies(own, policies, scenarios), strict=True):
             for name, one in zip(names, flown, strict=True):
                 found.setdefault(name, []).append(one)
     recorded, rows = parse_json(OTHERS.read_text())["levels"], []
@@ -208,7 +208,7 @@ def fly_others(config: Config) -> dict[str, list[Row]]:
     every = [cell for cell in cells.feasible(config) if cell[1] > cells.reach_of(config, cell[2], False)]
     for disturbed in (False, True):
         common = {"believed_mass": cells.BELIEVED}
-        found = {rival.name: cells.fly(rival, every, common, disturbed, FLIGHTS) for rival in rivals}
+        found = {rival.name: cells.fly_cells(rival, every, common, disturbed, FLIGHTS) for rival in rivals}
         for number, cell in enumerate(every):
             peak, name = min((rows[number]["peak"], name) for name, rows in found.items())
             beyond.append({"cell": cell, "disturbed": disturbed, "peak": peak, "peak of": name})
@@ -218,15 +218,15 @@ def fly_others(config: Config) -> dict[str, list[Row]]:
 def of_cells(config: Config, policies: list[Policy]) -> list[Row]:
     """Of every policy: the cells that it meets, those beyond trim, changes of its commands."""
     every, others = cells.feasible(config), parse_json(OTHERS.read_text())["beyond trim"]
-    calm = cells.fly(make_baseline("lqg", config), every, {}, False, PHASES)
+    calm = cells.fly_cells(make_baseline("lqg", config), every, {}, False, PHASES)
     beyond = {(tuple(row["cell"]), row["disturbed"]): row["peak"] for row in others}
     rows: list[Row] = [{"cells": [], "beyond trim": [], "commands": []} for _ in policies]
     for known, disturbed in CONDITIONS:
         common = {} if known else {"believed_mass": cells.BELIEVED}
         rival = make_baseline("adaptive" if known else "adaptive-mass", config)
-        theirs = cells.fly(rival, every, common, disturbed, PHASES)
+        theirs = cells.fly_cells(rival, every, common, disturbed, PHASES)
         scenarios = cells.scenarios_of(every, common, disturbed, PHASES)
-        for row, flown in zip(rows, fly(config, policies, scenarios), strict=True):
+        for row, flown in zip(rows, fly_policies(config, policies, scenarios), strict=True):
             won, held, near = 0, 0, 0
             for number, (cell, own) in enumerate(zip(every, cells.medians(flown, len(every)), strict=True)):
                 if known or cell[1] <= cells.reach_of(config, cell[2], False):
@@ -261,7 +261,7 @@ def of_flights(config: Config, policies: list[Policy], count: int) -> list[Row]:
     rows: list[Row] = [{"flights": []} for _ in policies]
     for unknown in (False, True):
         scenarios = stability.random_scenarios(config, count, unknown, 1)
-        for row, flown in zip(rows, fly(config, policies, scenarios), strict=True):
+        for row, flown in zip(rows, fly_policies(config, policies, scenarios), strict=True):
             middle, high, most = map(float, np.quantile([stability.peak(one) for one in flown], [0.5, 0.99, 1.0]))
             failed = sum(one.failed for one in flown)
             row["flights"].append({"failed": failed, "median": middle, "99 %": high, "largest": most})

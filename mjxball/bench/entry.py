@@ -30,7 +30,7 @@ SHARES = ("met", "low", "high", "failed")  # required values of one condition
 VALUES = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
 
 
-def run(
+def make_entry(
     name: str,
     make: FollowerFactory,
     tracks: Sequence[str],

@@ -25,13 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, command: str) -> int:
     """Fly the tracks and write the entry; return the exit code."""
-    from mjxball.bench.entry import run as fly
-    from mjxball.bench.entry import table
+    from mjxball.bench.entry import make_entry, table
     from mjxball.bench.followers import entrant
 
     cli.output_file(options.out, ".json")
     name, make = entrant(options.follower)
-    entry = fly(name, make, options.tracks, options.draw, clock())
+    entry = make_entry(name, make, options.tracks, options.draw, clock())
     origin = {"command": command, "commit": commit(), "versions": versions()}
     write_atomically(options.out, json.dumps({**entry, **origin}, indent=1, allow_nan=False) + "\n")
     print(f"{table(entry)}\nthe entry is {options.out}")

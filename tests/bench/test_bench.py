@@ -16,7 +16,7 @@ from command_line import REPOSITORY, call
 
 from mjxball.baselines import make_baseline
 from mjxball.bench import followers, references, success
-from mjxball.bench.entry import CONDITIONS, read_entry, run
+from mjxball.bench.entry import CONDITIONS, make_entry, read_entry
 from mjxball.bench.tracks import MARGIN, TRACKS, World, worlds_of
 from mjxball.commands.evaluate import main
 from mjxball.evaluate.metrics import measure
@@ -222,7 +222,7 @@ def test_a_flight_is_met_that_is_as_good_as_the_best_reference(monkeypatch: pyte
     copy = simulate(config, make_baseline("copy", config), pair[0], "newton-euler")
     found["copy"] = [measure(copy, config.scenario.termination_distance)]
     for name, flights in found.items():
-        entry = run(name, lambda config, name=name: make_baseline(name, config), ["pair"], 0)
+        entry = make_entry(name, lambda config, name=name: make_baseline(name, config), ["pair"], 0)
         good = all(own <= bar for own, bar in zip(success.numbers(flights[0]), bars[0], strict=True))
         assert entry["tracks"]["pair"]["undisturbed"]["met"] == good
     assert not good  # copy
@@ -232,7 +232,7 @@ def test_a_flight_is_met_that_is_as_good_as_the_best_reference(monkeypatch: pyte
 
 def test_an_onnx_file_of_a_policy_comes_to_what_the_policy_does(short: Path):
     assert export([str(BALANCE), "balance.onnx"]) == 0
-    both = [run(*followers.entrant(text), ["pair"], 0)["tracks"] for text in (str(BALANCE), "balance.onnx")]
+    both = [make_entry(*followers.entrant(text), ["pair"], 0)["tracks"] for text in (str(BALANCE), "balance.onnx")]
     for condition in CONDITIONS:
         ours, theirs = (one["pair"][condition] for one in both)
         assert ours["met"] == theirs["met"]
@@ -404,7 +404,7 @@ def test_references_come_to_what_their_entries_say(track: str):
     """Flights, references, what is met and what is measured: whatever of them changes is another version."""
     name = "lqg" if track == "crazyflie" else "lqg-slow"
     entry = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())
-    found = run(name, lambda config: make_baseline(name, config), [track], 0)["tracks"][track]
+    found = make_entry(name, lambda config: make_baseline(name, config), [track], 0)["tracks"][track]
     for condition in CONDITIONS:
         wanted = entry["tracks"][track][condition]
         assert found[condition]["met"] == wanted["met"]

@@ -39,7 +39,7 @@ from mjxball.sim.rigs import (
 )
 from mjxball.sim.rollout import load_of, simulate, start_of
 from mjxball.sim.scenario import Scenario
-from random_rigs import AnyRigController, fly, rig_controllers, stacked
+from random_rigs import AnyRigController, fly_random_rigs, rig_controllers, stacked
 
 UNIVERSAL = preset("universal")
 POLICY = shipped_policy("universal")
@@ -205,7 +205,7 @@ class TestUniversal:
     def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
         rigs = held_out(UNIVERSAL, size, 4)
         controller = AnyRigController(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
-        found = [one for own in fly(UNIVERSAL, rigs, controller, flights=2, seconds=21.0) for one in own]
+        found = [one for own in fly_random_rigs(UNIVERSAL, rigs, controller, flights=2, seconds=21.0) for one in own]
         assert not any(one.failed for one in found)
         assert np.median([one.peak for one in found]) < 0.1
 
@@ -225,7 +225,7 @@ class TestUniversal:
             def step(self, memory: Any, observation: Any, known: Any) -> Any:
                 return memory, jnp.broadcast_to(self.commands, (*observation.shape[:-2], 2, 3))
 
-        flown = [fly(UNIVERSAL, rigs, Apart(lift), 2, 25 * period) for lift in (0.3, 8.0)]
+        flown = [fly_random_rigs(UNIVERSAL, rigs, Apart(lift), 2, 25 * period) for lift in (0.3, 8.0)]
         calm, hard = ([one for own in found for one in own] for found in flown)
         for row, one in enumerate(calm[::2]):
             turned = mount_angles(rig_config(UNIVERSAL, rigs, row).plant)
