@@ -28,14 +28,14 @@ FOLLOWERS = {
     "balance": "**`balance`**: learned by gradients",
 }
 TEXT = """
-follower | settles to 2 % [s] | 90 % of peaks [mm] | success [%] | success, mass unknown [%] | rotor at its limit [%]
+follower | settles to 2 % [s] | 90 % of peaks below [mm] | success [%] | mass unknown [%] | rotor at its limit [%]
 ---|---|---|---|---|---
 {table}
 
 `balance` settles soonest, undisturbed sways least, and serves known and unknown masses with one set of {parameters}
 weights. Under noise its commands change by {own:.0f} mrad a step, those of the others that settle within 3 s by
 {least:.0f} to {most:.0f}; of these `{sparing}` spares the rotors most. Of classical controllers `lqg-slow` succeeds
-most, given the mass. The training below has {first:.0f} %.
+most often, where it knows the mass. The training below succeeds in {first:.0f} %.
 
 """
 

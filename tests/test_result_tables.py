@@ -43,7 +43,7 @@ def levels() -> Iterator[tuple[str, Numbers]]:
 
 def seeds() -> Iterator[tuple[str, Numbers]]:
     found = measured("balance_seeds")["rows"]
-    yield "cases met", np.min([row["cells"] for row in found], axis=0).tolist()
+    yield "successes", np.min([row["cells"] for row in found], axis=0).tolist()
     flights = [flown for row in found for flown in row["flights"]]
     yield "failed", [max(flown["failed"] for flown in flights)]
     yield "99 % of", [1e3 * max(flown["99 %"] for flown in flights)]
