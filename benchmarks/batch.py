@@ -44,14 +44,15 @@ def fly_compiled(
     # Half of the time for hundreds of worlds; MJX and the cascade of a Crazyflie gain nothing, and compile longer.
     rewritten = physics == "newton-euler" and config.autopilot.kind == "ideal"
     step = (scalar_form if rewritten else jax.vmap)(make_plant_step(config, engine, jax_repeat))
-    loop, privileged = ClosedLoop(config, step, flown.sensors), make_privileged_info(config)
+    loop = ClosedLoop(config, step, flown.sensors, jitters=flown.inputs.late is not None)
+    privileged = make_privileged_info(config)
     on_pid = np.float32(not isinstance(follower, Baseline))
     leader, limit = config.plant.leader, config.scenario.termination_distance
 
     def fly(load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> metrics.RunningMetrics:
-        goal = inputs.goal[0]
-        state, observation = loop.start(start, goal, first, flown.delays)
-        running = metrics.begin(start.position, goal, start.rotor_force, leader)
+        goal = inputs.at(0).goal
+        state, observation = loop.start(start, goal, load, first, flown.settings)
+        running = metrics.begin(start.position, goal.position, start.rotor_force, leader)
 
         def advance(carried: Any, now: Inputs) -> tuple[Any, None]:
             carry, row = control_step(loop, controller, privileged, load, carried[0], now, on_pid)

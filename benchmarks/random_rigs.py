@@ -24,6 +24,7 @@ from mjxball.plant import PlantParameters
 from mjxball.policy.inference import NetworkController
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import RandomDisturbances
+from mjxball.sim.goals import Goal
 from mjxball.sim.rigs import RigTable, rig_config, whole
 from mjxball.sim.rollout import Carry, Inputs, control_step
 
@@ -71,7 +72,7 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, 
     world, observation = state.pipeline_state, state.obs[..., :OBSERVATION_SIZE]
     disturbances, parameters = RandomDisturbances(config), whole(world.parameters, config.plant.gravity)
     physics = make_jax_plant_step(config, "newton-euler", parameters)
-    loop = ClosedLoop(config, physics, disturbances.sensors, parameters)
+    loop = ClosedLoop(config, physics, disturbances.sensors, parameters, disturbances.jitters)
     limit, leader = config.scenario.termination_distance, config.plant.leader
     if isinstance(controller, AnyRigController):
         controller = controller.on(rig, config.plant)
@@ -81,9 +82,10 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, 
 
     def step(carried: tuple[Carry, Any, RunningMetrics], time: Any) -> Any:
         carry, random, running = carried
-        force = random.force if disturbances.present else None
+        force, late = (random.force, random.late) if disturbances.present else (None, None)
         random, sample = disturbances.step(random)
-        inputs, plant = Inputs(time, world.goal, world.goal, force, sample), carry.loop.plant
+        goal, plant = Goal(world.goal), carry.loop.plant
+        inputs = Inputs(time, goal, goal, force, late, sample)
         carry, row = control_step(loop, controller, privileged, world.load, carry, inputs, 0.0)
         most = rig.parameters.rotor_force_max * rig.thrust * (1.0 - rig.thrust_fade * plant.time)
         row = jax.tree.map(lambda part: part[None], row)._replace(time=time)

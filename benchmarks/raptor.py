@@ -93,7 +93,7 @@ def fly_world(world: World, raptor: Any) -> list[metrics.Metrics]:
     config = dataclasses.replace(world.config, plant=plant, timing=timing)
     step, most = _rotor_step(config), np.array(plant.of_drones("rotor_force_max"))[:, None]
     flown = scenario_arrays(config, scenarios)
-    state, inputs, goal = flown.start, flown.inputs, flown.inputs.goal[0]
+    state, inputs, goal = flown.start, flown.inputs, flown.inputs.goal.position[0]
     mounts = np.array(plant_parameters(plant, config.attitude).mounts, float)
 
     def truth(state: PlantState, drone: int) -> np.ndarray:
@@ -102,7 +102,7 @@ def fly_world(world: World, raptor: Any) -> list[metrics.Metrics]:
 
     raptor.reset()
     follower, nothing = plant.followers[0], np.zeros((len(goal), 3))
-    sensed, measured = flown.sensors.start(truth(state, follower), flown.first, flown.delays)
+    sensed, measured = flown.sensors.start(truth(state, follower), flown.first, flown.settings)
     running = metrics.begin(state.position, goal, state.rotor_force, plant.leader)
     limits = metrics.rotor_limits(plant, scenarios)
     command = 2 * np.clip(state.rotor_force / most, 0.0, 1.0) - 1

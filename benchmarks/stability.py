@@ -43,8 +43,9 @@ from mjxball.physics.step import jax_repeat, make_plant_step, start_state
 from mjxball.running import run_command
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
-from mjxball.sim.disturbances import Sample, SensorModel, SensorState
+from mjxball.sim.goals import Goal
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.sensors import OWN, Sample, SensorModel, SensorSettings, SensorState
 
 SETTLE, WATCHED = 3000, 1000  # control steps flown towards the fixed point, and those whose mean is taken
 NEWTON, HALVINGS = 40, 12  # then steps of Newton's method, each as short as makes the residual smallest
@@ -141,7 +142,8 @@ def closed_loop(
     """
     period = config.timing.control_period
     physics = make_plant_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
-    privileged, loop = rollout.make_privileged_info(config), ClosedLoop(config, physics, SensorModel(delay))
+    sensors = SensorModel(delay, present=delay > 0)
+    privileged, loop = rollout.make_privileged_info(config), ClosedLoop(config, physics, sensors)
     goal, still, zero = jnp.zeros(3), jnp.zeros(3), jnp.zeros(())
 
     def flat(plant: PlantState, memory: Any, past: Array) -> tuple[Array, Any]:
@@ -151,7 +153,7 @@ def closed_loop(
     def first(load: Load) -> tuple[PlantState, Any, Array]:
         plant = start_state(config, still, still, still, load.believed_mass, zero)
         observation = loop.observe(plant, goal)
-        return plant, controller.start(observation), jnp.broadcast_to(observation, (delay, *observation.shape))
+        return plant, controller.start(observation), jnp.broadcast_to(observation[:OWN], (delay, OWN))
 
     def start(load: Load) -> Array:
         return flat(*first(load))[0]
@@ -161,10 +163,11 @@ def closed_loop(
         position, euler, velocity, rates, rotors, memory, older = unflatten(z)
         begin, turn = jnp.zeros((), jnp.int32), rotations.quaternion_from_euler(euler)
         plant = PlantState(position, turn, velocity, rates, rotors, begin, zero, zero, zero)
-        past = jnp.concatenate([loop.observe(plant, goal)[None], older])
-        sensors = SensorState(delay, (), past) if delay else SensorState()
-        state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
-        carry, inputs = rollout.Carry(state, past[-1], memory), rollout.Inputs(zero, goal, goal, None, Sample())
+        past = jnp.concatenate([loop.observe(plant, goal)[None, :OWN], older])
+        late = SensorState(SensorSettings(delay), past=past) if delay else ()
+        state = LoopState(plant, loop.zero_integral(still), late, jnp.zeros((), bool))
+        carry = rollout.Carry(state, loop.observe_by(past[-1], goal), memory)
+        inputs = rollout.Inputs(zero, Goal(goal), Goal(goal), None, None, Sample())
         (moved, _, memory), _ = rollout.control_step(loop, controller, privileged, load, carry, inputs, 0.0)
         older = moved.sensors.past[1:] if delay else older
         # A flight that diverged stays where it was, which is no hover.

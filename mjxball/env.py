@@ -26,8 +26,10 @@ from mjxball.plant import PlantParameters, plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop, LoopState, TeamCommands
 from mjxball.sim.disturbances import RandomDisturbances, followers_axis
 from mjxball.sim.follower import network_interface
+from mjxball.sim.goals import Goal
 from mjxball.sim.randomization import ResetDistribution, SampledRig
 from mjxball.sim.rigs import RigTable, whole
+from mjxball.sim.sensors import SensorSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -58,13 +60,14 @@ class PipelineState(NamedTuple):
 
     loop: LoopState  # plant, leader's integral, sensors
     load: Load
-    goal: Float[Array, "3"]  # of O [m]
+    goal: Float[Array, "3"]  # of O, now [m]
     disturbances: Any  # `sim.disturbances.RandomState`, () without disturbances
     memory: Any  # (m,) the follower's memory, () if m is 0: XLA's partitioner fails on empty arrays
     action: Float[Array, "... 3"]  # last network actions in [-1, 1]
     command: Float[Array, "... 3"]  # last followers' commands: roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
     parameters: Any = ()  # `plant.PlantParameters` of this world; () if all worlds have the plant's
+    goal_path: Any = ()  # `sim.goals.GoalPath`; () if goals rest
 
     @property
     def plant(self) -> PlantState:
@@ -229,22 +232,23 @@ class TransportEnv:
         """The next state after the followers' `command`, with their new `memory`. `on_pid`: see `ClosedLoop.step`."""
         world: PipelineState = state.pipeline_state
         observation = self._observed(state)
-        load = world.load
+        load, steps = world.load, world.steps + 1
         if self._disturbances.present:
-            load = load._replace(external_force=world.disturbances.force)
+            load = load._replace(external_force=world.disturbances.force, late=world.disturbances.late)
         disturbances, sample = self._disturbances.step(world.disturbances)
-        before, goals = world.loop._replace(diverged=diverged), (world.goal, world.goal)
+        before, goals = world.loop._replace(diverged=diverged), (self.goal(world), self.goal(world, steps))
         closed_loop = self._loop_of(world.parameters)
         loop, after, commands = closed_loop.step(before, observation, command, load, goals, sample, on_pid, plant_step)
         moved = world._replace(
             loop=loop,
+            goal=goals[1].position,
             disturbances=disturbances,
             memory=memory,
             action=action[..., : layout.ACTION_SIZE],
             command=command,
-            steps=world.steps + 1,
+            steps=steps,
         )
-        distance = jnp.linalg.norm(world.goal - loop.plant.position)
+        distance = jnp.linalg.norm(goals[1].position - loop.plant.position)
         terminated = jnp.logical_or(loop.diverged, distance > self.config.scenario.termination_distance)
         # Brax's EpisodeWrapper applies the time limit itself, and would take ours for a termination.
         wrapped = "steps" in state.info
@@ -254,7 +258,7 @@ class TransportEnv:
         return state.replace(
             pipeline_state=moved,
             obs=self.seen(moved, after),
-            reward=rewards.reward(self.config.reward, self._transition(world, moved, commands, terminated)),
+            reward=rewards.reward(self.config.reward, self._transition(world, moved, goals[1], commands, terminated)),
             done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
             metrics={
                 **state.metrics,
@@ -270,7 +274,15 @@ class TransportEnv:
 
     def _make_loop(self, parameters: PlantParameters | None = None) -> ClosedLoop:
         make = functools.partial(make_jax_plant_step, self.config, self._backend, parameters)
-        return ClosedLoop(self.config, _lazy_plant_step(make), self._disturbances.sensors, parameters)
+        disturbances = self._disturbances
+        return ClosedLoop(self.config, _lazy_plant_step(make), disturbances.sensors, parameters, disturbances.jitters)
+
+    def goal(self, world: PipelineState, steps: Int[Array, ""] | None = None) -> Goal:
+        """The goal of O `steps` after the reset, by default now."""
+        if world.goal_path == ():
+            return Goal(world.goal)
+        steps = world.steps if steps is None else steps
+        return world.goal_path.at(self.config.timing.control_period * steps.astype(jnp.float32))
 
     def _loop_of(self, parameters: Any) -> ClosedLoop:
         """The closed loop of a world with these `PipelineState.parameters`."""
@@ -288,20 +300,23 @@ class TransportEnv:
         load, plant, goal, rig = self._resets.sample(rng, number, chosen)
         parameters = () if rig is None else rig.parameters if rig.row is None else rig.row.parameters
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
-        delay = disturbances.delay if self._disturbances.present else 0
+        settings = disturbances.settings if self._disturbances.present else SensorSettings()
         has_integrals = self._resets.has_battery and self.config.follower.residual_on_pid
         integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if has_integrals else None
-        loop, observation = self._loop_of(parameters).start(plant, goal, sample, delay, integral)
+        path = self._resets.goal_path(goal, rng)
+        first = Goal(goal) if path == () else path.at(jnp.zeros(()))
+        loop, observation = self._loop_of(parameters).start(plant, first, load, sample, settings, integral)
         world = PipelineState(
             loop=loop,
             load=load,
-            goal=goal,
+            goal=first.position,
             disturbances=disturbances,
             memory=self._interface.start(observation, self._geometry(rig)) if self._interface.size else (),
             action=jnp.zeros((*self._followers, 3)),
             command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
             parameters=parameters,
+            goal_path=path,
         )
         return world, observation
 
@@ -355,8 +370,9 @@ class TransportEnv:
         masses = jnp.stack([mass, mass - load.believed_mass])
         parts: list[Any] = [offset, mass * offset, masses]
         if self._disturbances.present:
-            truth, disturbed = loop.observe(world.plant, world.goal), world.disturbances
-            levels = jnp.stack([disturbed.noise, disturbed.delay.astype(jnp.float32)])
+            goal, disturbed = self.goal(world), world.disturbances
+            truth = loop.observe(world.plant, goal.position, goal.rate)
+            levels = jnp.stack([disturbed.noise, disturbed.settings.delay.astype(jnp.float32)])
             force = loop.seen_by_followers(disturbed.force) if self._followers else disturbed.force
             parts += [truth[..., 3:], force, levels]
         if self._resets.varies:
@@ -387,14 +403,19 @@ class TransportEnv:
         return jnp.stack([jnp.broadcast_to(each[self.config.plant.leader], own.shape), own], axis=-1)
 
     def _transition(
-        self, before: PipelineState, after: PipelineState, commands: TeamCommands, terminated: Bool[Array, ""]
+        self,
+        before: PipelineState,
+        after: PipelineState,
+        goal: Goal,
+        commands: TeamCommands,
+        terminated: Bool[Array, ""],
     ) -> rewards.RewardInputs:
         """Inputs of the reward of the step from `before` to `after`."""
         plant = after.plant
         remembers = bool(self.config.follower.observation_averages)
         return rewards.RewardInputs(
-            error=after.goal - plant.position,
-            velocity=plant.velocity,
+            error=goal.position - plant.position,
+            velocity=plant.velocity if goal.rate is None else plant.velocity - goal.rate,
             euler=rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion)),
             rates=plant.rates,
             action=after.action,

@@ -36,6 +36,11 @@ class ScenarioRanges:
     """Distribution of flights: every reset samples uniformly from each range."""
 
     goal_range: float = setting(1.0, "range +- of each coordinate of the goal [m]", low=0, high=1e4)
+    goal_motion_probability: float = setting(
+        0.0, "probability of a goal that moves along a line or around a circle", low=0, high=1
+    )
+    goal_speed: Range = sampled((0.0, 0.5), "speed of goals that move [m/s]", low=0, high=100)
+    goal_step_probability: float = setting(0.0, "probability that the goal jumps once, 5 to 15 s on", low=0, high=1)
     start_position: float = setting(0.0, "range +- of each coordinate of the start [m]", low=0, high=1e4)
     start_velocity: float = setting(0.0, "range +- of each component of the start velocity [m/s]", low=0, high=100)
     start_tilt: float = setting(0.0, "range +- of roll and pitch at the start [rad]", low=0, high=1)
@@ -57,7 +62,24 @@ class ScenarioRanges:
     estimator_drift: Range = sampled(
         (0.0, 0.0), "slow measurement error, in standard deviations of a drone's estimator", low=0, high=100
     )
-    calm_probability: float = setting(0.0, "probability of a flight without noise, drift and gusts", low=0, high=1)
+    offset: Range = sampled(
+        (0.0, 0.0), "constant errors of each drone's measurements, in standard deviations", low=0, high=100
+    )
+    pose_lag: Range = sampled(
+        (0.0, 0.0), "time constant with which measured position and velocity follow the true ones [s]", low=0, high=1
+    )
+    gap_rate: Range = sampled(
+        (0.0, 0.0), "mean number of gaps of up to 0.5 s in the measurements [1/s]", low=0, high=10
+    )
+    jitter: Range = sampled(
+        (0.0, 0.0), "commands take effect up to so late, less than a control period [s]", low=0, high=1
+    )
+    object_sensor: bool = setting(
+        False, "the object's error has a sensor of its own; else followers compute it from their own states"
+    )
+    calm_probability: float = setting(
+        0.0, "probability of a flight without noise, drift, gusts, gaps, lag and jitter", low=0, high=1
+    )
     quantize: bool = setting(False, "measured states have the resolution of a Crazyflie's log packets")
     leader_uses_measurements: bool = setting(False, "the leader uses the follower's measurements, else the true state")
     battery: Range = sampled((0.0, 0.0), "voltage of the battery; 0: motors follow their curve [V]", low=0, high=100)
@@ -65,6 +87,24 @@ class ScenarioRanges:
         0.0, "probability of a firmware that does not compensate for the battery", low=0, high=1
     )
     gust: Range = sampled((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, high=1e4)
+    rotor_drag: Range = sampled((0.0, 0.0), "rotor drag of each drone over its mass [1/s]", low=0, high=100)
+    wind: Range = sampled(
+        (0.0, 0.0), "speed of a steady wind in any horizontal direction, felt by rotor drag [m/s]", low=0, high=100
+    )
+    floor_clearance: Range = sampled(
+        (0.0, 0.0),
+        "height of the lower of start and goal above the ground, for ground effect; 0: no ground [m]",
+        low=0,
+        high=1e4,
+    )
+    download: Range = sampled((0.0, 0.0), "share of its thrust that a rotor above the object loses", low=0, high=0.9)
+    attitude_frequency: Range = sampled(
+        (0.0, 0.0),
+        "natural frequency of ideal roll loops, pitch and yaw in proportion; 0: that of attitude [rad/s]",
+        low=0,
+        high=1000,
+    )
+    thrust_fade: Range = sampled((0.0, 0.0), "share of all thrust that is lost in a second [1/s]", low=0, high=0.02)
     rotor_lag_scale: Range = sampled((1.0, 1.0), "factor on the rotors' time constant", low=0.001, high=1000)
     thrust_scale: Range = sampled(
         (1.0, 1.0), "factor on the rotor forces of each drone, sampled for each", low=0.001, high=1000

@@ -77,6 +77,14 @@ def validate(config: Config) -> Config:
             f"scenario.goal_range and start_position allow |e_o| = {farthest:.3g} m at the start, "
             f"beyond termination_distance {config.scenario.termination_distance:g} m"
         )
+    if config.scenario.attitude_frequency[1] > 0 and config.autopilot.kind != "ideal":
+        raise InputError("scenario.attitude_frequency is of ideal attitude loops, and autopilot.kind is another")
+    if 0 in config.scenario.attitude_frequency and any(config.scenario.attitude_frequency):
+        raise InputError("scenario.attitude_frequency must be 0 0, or positive")
+    if config.scenario.wind[1] > 0 and config.scenario.rotor_drag[1] == 0:
+        raise InputError("scenario.wind acts through scenario.rotor_drag, which is 0")
+    if config.scenario.jitter[1] >= config.timing.control_period:
+        raise InputError(f"scenario.jitter must be below timing.control_period {config.timing.control_period:g} s")
     if config.physics_step > 0.005 + 1e-12:
         raise InputError(
             f"timing gives physics steps of {config.physics_step * 1e3:.3g} ms, but the attitude loop "

@@ -7,6 +7,13 @@ from mjxball.control import mixer
 from mjxball.plant.parameters import AttitudeGains
 
 
+def scaled_gains(gains: AttitudeGains, scale: Array) -> AttitudeGains:
+    """`gains` for `scale` (...) times the natural frequency and the same damping: Kp s^2, Kd s, (..., 1, 3)."""
+    kp, kd = (scale.__array_namespace__().asarray(gain, dtype=scale.dtype) for gain in gains)
+    factor = scale[..., None, None]
+    return AttitudeGains(factor * factor * kp, factor * kd)
+
+
 def rotor_commands(
     command: Array,
     euler: Array,

@@ -25,16 +25,16 @@ def rotor_targets(
     parameters: PlantParameters,
     state: PlantState,
     commands: Float[Array, "... drones 3"],
-    believed_mass: Scalar,
+    load: Load,
 ) -> Float[Array, "... drones 4"]:
     """Rotor forces [N] that all ideal attitude loops ask for at `commands` (roll, pitch, vertical acceleration)."""
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+    euler, commands = estimated(state, commands, load)
     return attitude.rotor_commands(
         commands,
-        euler[..., None, :],
+        euler,
         state.rates[..., None, :],
-        carried_mass(parameters, believed_mass),
-        parameters.gains,
+        carried_mass(parameters, load.believed_mass),
+        parameters.gains if load.loop_scale is None else attitude.scaled_gains(parameters.gains, load.loop_scale),
         parameters.gravity,
         parameters.arm,
         parameters.yaw_per_thrust,
@@ -42,6 +42,19 @@ def rotor_targets(
         config.plant.layout,
         parameters.yaw,
     )
+
+
+def estimated(
+    state: PlantState, commands: Float[Array, "... drones 3"], load: Load
+) -> tuple[Float[Array, "... drones 3"], Float[Array, "... drones 3"]]:
+    """(roll, pitch, yaw as each drone estimates them, `commands` in body axes as drones with turned mounts fly them).
+
+    Where no drone is off, the first has an axis of 1 in place of N.
+    """
+    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))[..., None, :]
+    if load.attitude_error is None:
+        return euler, commands
+    return euler + load.attitude_error, rotations.turned_about_z(commands, load.attitude_error[..., 2])
 
 
 def carried_mass(parameters: PlantParameters, believed_mass: Scalar) -> Float[Array, "... drones"]:
@@ -57,7 +70,7 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
     if config.autopilot.kind == "ideal":
         return lambda state, commands, load: (
             state.loops,
-            rotor_targets(config, constants, state, commands, load.believed_mass),
+            rotor_targets(config, constants, state, commands, load),
         )
 
     with_battery = make_battery_autopilot(config, constants)
@@ -72,9 +85,9 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
             zero = commands[..., 0, 0] * 0.0
             return with_battery(state, commands, load._replace(battery=zero + motors.USUAL_BATTERY, uncompensated=zero))
         xp, autopilot, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
+        euler, commands = estimated(state, commands, load)
         sent = crazyflie.setpoints(autopilot, commands, carried_mass(constants, load.believed_mass), gravity)
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        euler, rates = (xp.broadcast_to(each, commands.shape) for each in (euler, state.rates[..., None, :]))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         loops, duty = crazyflie.cascade(autopilot, state.loops, sent, euler, rates, integrals)
         return loops, crazyflie.motor_force(autopilot.motor_curve, duty)
@@ -103,13 +116,13 @@ def make_battery_autopilot(config: Config, parameters: PlantParameters | None = 
         uncompensated: Array = load.uncompensated
         volts: Array = load.battery
         old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]
+        euler, commands = estimated(state, commands, load)
         sent = xp.where(
             old,
             crazyflie.setpoints(older, commands, carried, gravity),
             crazyflie.setpoints(autopilot, commands, carried, gravity),
         )
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        euler, rates = (xp.broadcast_to(each, commands.shape) for each in (euler, state.rates[..., None, :]))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
 

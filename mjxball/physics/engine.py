@@ -104,6 +104,16 @@ class Load(NamedTuple):
     cg_shape: PathShape | None = None  # of the path in a plane; None: a sine along x
     stop_time: Float[Array, "... drones"] | None = None  # when each drone's rotors stop [s]; None: never
     thrust_fade: Scalar | None = None  # share of all rotor forces that is lost in a second [1/s]; None: none
+    loop_scale: Scalar | None = None  # factor on the natural frequency of the ideal attitude loops; None: 1
+    rotor_drag: Scalar | None = None  # of a drone over its mass [1/s], see `physics.aerodynamics`; None: none
+    wind: Vector | None = None  # velocity of the air in the world, felt by rotor drag [m/s]; None: none
+    floor: Scalar | None = None  # height of the ground in the world, for ground effect [m]; None: no ground
+    download: Scalar | None = None  # share of the thrust that a rotor above the object loses; None: none
+    # What each drone's attitude estimate is off: roll, pitch, and yaw, by which its mount is turned [rad]; None: exact.
+    attitude_error: Float[Array, "... drones 3"] | None = None
+    # Physics steps of this control step in which the drones still fly `last_commands`; None: none.
+    late: Scalar | None = None
+    last_commands: Float[Array, "... drones 3"] | None = None
 
 
 class Wrench(NamedTuple):
@@ -134,22 +144,34 @@ def rotor_wrenches(
     return mixer.turned(wrench, parameters.yaw)
 
 
-def total_wrench(plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"]) -> Wrench:
-    """Wrench about O of all rotors, `rotor_force` [N]: T e3 and the sum of tau_i + r_i x T_i e3 over the drones."""
+def total_wrench(
+    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], drag: Array | None = None
+) -> Wrench:
+    """Wrench about O of all rotors, `rotor_force` [N]: T e3 and the sum of tau_i + r_i x T_i e3 over the drones.
+
+    `drag` (..., N, 3) of the air on each drone in body axes [N] is added to its thrust T_i e3.
+    """
     drones = rotor_wrenches(plant, parameters, rotor_force)
-    thrust = drones[..., :1] * UPWARDS
-    torque = drones[..., 1:] + rotations.cross(parameters.mounts, thrust)
-    return Wrench(thrust.sum(axis=-2), torque.sum(axis=-2))
+    force = drones[..., :1] * UPWARDS
+    force = force if drag is None else force + drag
+    torque = drones[..., 1:] + rotations.cross(parameters.mounts, force)
+    return Wrench(force.sum(axis=-2), torque.sum(axis=-2))
 
 
 def contact_wrenches(
-    plant: Plant, parameters: PlantParameters, state: PlantState, linear: Vector, angular: Vector
+    plant: Plant,
+    parameters: PlantParameters,
+    state: PlantState,
+    linear: Vector,
+    angular: Vector,
+    drag: Array | None = None,
 ) -> tuple[Float[Array, "... drones 3"], Float[Array, "... drones 3"]]:
     """Contact forces [N] and torques [N m] of every drone on the carrier, body axes, about each drone's own centre.
 
-    `linear` is the acceleration of O in the world [m/s2], `angular` the angular acceleration in body axes [rad/s2]:
+    `linear` is the acceleration of O in the world [m/s2], `angular` the angular acceleration in body axes [rad/s2],
+    `drag` (..., N, 3) as in `total_wrench`, D_i:
 
-        F_i = T_i e3 - m_i g R^T E3 - m_i a_i,  a_i = a_b + w' x r_i + w x (w x r_i)
+        F_i = T_i e3 + D_i - m_i g R^T E3 - m_i a_i,  a_i = a_b + w' x r_i + w x (w x r_i)
         tau_i = tau_rotor,i - w x I_i w - I_i w'
     """
     matrix = rotations.matrix_from_quaternion(state.quaternion)
@@ -159,6 +181,7 @@ def contact_wrenches(
     lever = cross(turning, mounts) + cross(rates, cross(rates, mounts))
     rotors = rotor_wrenches(plant, parameters, state.rotor_force)
     force = rotors[..., :1] * UPWARDS - parameters.drone_mass[..., None] * (held + lever)
+    force = force if drag is None else force + drag
     torque = rotors[..., 1:] - cross(rates, rotations.rotate(own, rates)) - rotations.rotate(own, turning)
     return force, torque
 

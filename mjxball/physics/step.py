@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjxball.arrays import Array, clipped
-from mjxball.config import Config
+from mjxball.config import Config, Plant
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
-from mjxball.physics import motion
+from mjxball.physics import aerodynamics, motion
 from mjxball.physics.autopilot import Autopilot, carried_mass, make_autopilot
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench, total_wrench
 from mjxball.plant import PlantParameters, plant_parameters
@@ -72,6 +72,10 @@ def make_plant_step(
     autopilot = autopilot or make_autopilot(config, params)
 
     def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
+        if load.late is not None:
+            number = state.ticks // 2 % config.timing.physics_steps
+            before = (number < load.late)[..., None, None]
+            commands = commands.__array_namespace__().where(before, load.last_commands, commands)
         loops, target = autopilot(state, commands, load)
         keep, mean = lag_weights(params.rotor_lag, load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
@@ -82,7 +86,7 @@ def make_plant_step(
             target = target * (state.time[..., None] < load.stop_time)[..., None]
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
-        wrench = with_external_force(total_wrench(plant, params, acting), middle, load)
+        wrench = acting_wrench(plant, params, acting, middle, load)
         linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
@@ -147,12 +151,28 @@ def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Coordinates]:
     return lambda state, load: cg_motion(state.time, load).offset
 
 
-def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
-    """Add the external force on O, `load.external_force` in the world, to `wrench`."""
+def acting_wrench(
+    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], state: PlantState, load: Load
+) -> Wrench:
+    """Wrench of rotors with `rotor_force` [N], of the air, and of the external force on O."""
+    wrench = total_wrench(
+        plant,
+        parameters,
+        lifting(parameters, rotor_force, state, load),
+        aerodynamics.drag(parameters, state, load),
+    )
     if load.external_force is None:
         return wrench
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.external_force))
+
+
+def lifting(
+    parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], state: PlantState, load: Load
+) -> Float[Array, "... drones 4"]:
+    """What rotors with `rotor_force` in free air exert [N], near the ground and above the object."""
+    factors = aerodynamics.rotor_factors(parameters, state, load)
+    return rotor_force if factors is None else factors * rotor_force
 
 
 def hover_rotor_force(

@@ -13,6 +13,7 @@ import numpy as np
 
 from mjxball.arrays import Array, joined
 from mjxball.config import Attitude, Plant, ball_limit
+from mjxball.plant.rotors import blocked_shares
 
 ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
 
@@ -45,6 +46,7 @@ class PlantParameters(NamedTuple):
     ball_inertia_per_mass: Array  # (3,) of the moving part about its own centre, per kg of object [m2]
     ball_limit: Array  # () offset of a rolling ball at which it touches an end stop or the rim [m]
     gravity: Array  # () [m/s2]
+    blocked: Array | None = None  # (N, 4) share of each rotor's wake that falls on the object; None: unknown, none
 
     @property
     def object_inertia_per_mass(self) -> Array:
@@ -144,6 +146,7 @@ def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
         ball_inertia_per_mass=ball,
         ball_limit=np.array(ball_limit(plant)),
         gravity=np.array(plant.gravity),
+        blocked=blocked_shares(plant),
     )
     inertia = np.diag(found.drone_inertia) + attitude.design_object_mass * found.object_inertia_per_mass
     gains = design_gains(inertia, attitude.natural_frequency, attitude.damping, plant.count)

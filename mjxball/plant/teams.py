@@ -72,7 +72,7 @@ def ring_config(config: Config, count: int) -> Config:
 def padded(parameters: PlantParameters, count: int) -> PlantParameters:
     """`parameters` padded to `count` drones; added drones have no mass, no thrust and no share of the load."""
     missing = count - parameters.size
-    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass"}
+    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass", "blocked"}
 
     def longer(name: str, value: Any) -> Any:
         if name not in nothing | {"mounts", "yaw", "arm", "yaw_per_thrust", "rotor_lag"}:

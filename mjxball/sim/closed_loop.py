@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Config
 from mjxball.physics.engine import has_diverged
-from mjxball.sim.controllers import Body, Controllers
+from mjxball.sim.controllers import Body, BodyState, Controllers
+from mjxball.sim.sensors import EXACT, OWN, SensorSettings
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import Load, PlantState, Scalar, Vector
     from mjxball.physics.step import PlantStep
     from mjxball.plant import PlantParameters
-    from mjxball.sim.controllers import Integral
-    from mjxball.sim.disturbances import Observation, Sample, SensorModel, SensorState
+    from mjxball.sim.controllers import Integral, Observation
+    from mjxball.sim.goals import Goal
+    from mjxball.sim.sensors import Sample, SensorModel
 
     FollowerCommand = Float[Array, "... 3"]  # of several followers (..., F, 3)
 
@@ -35,36 +37,49 @@ class LoopState(NamedTuple):
 
     plant: PlantState
     integral: Integral
-    sensors: SensorState
+    sensors: Any  # `SensorState`; () without sensor errors
     diverged: Bool[Array, "..."]  # where true, `plant` no longer changes
+    commands: Any = ()  # (..., N, 3) of all drones in the last period; () unless commands come late
 
 
 class ClosedLoop(Controllers):
     """Controllers with sensors and physics: call `start`, then `step` repeatedly; shapes as in `Controllers`."""
 
     def __init__(
-        self, config: Config, plant_step: PlantStep, sensors: SensorModel, parameters: PlantParameters | None = None
+        self,
+        config: Config,
+        plant_step: PlantStep,
+        sensors: SensorModel,
+        parameters: PlantParameters | None = None,
+        jitters: bool = False,
     ):
         super().__init__(config, parameters)
-        self._plant_step, self._sensors = plant_step, sensors
-        self._period = config.timing.control_period
+        self._plant_step, self._sensors, self._jitters = plant_step, sensors, jitters
+        self._period, self._count = config.timing.control_period, config.plant.count
         self._leader_measures = config.scenario.leader_uses_measurements
 
     def start(
         self,
         plant: PlantState,
-        goal: Vector,
+        goal: Goal,
+        load: Load,
         sample: Sample,
-        delay: Int[Array, "..."] | int = 0,
+        settings: SensorSettings = EXACT,
         integral: Integral | None = None,
     ) -> tuple[LoopState, Observation]:
         """(state, observation) before the first step, with the plant in state `plant`; `integral` None: zero.
 
-        `goal` of O [m]; `delay` (...) of the measurements in control steps.
+        `goal` of O; `settings` of the sensors.
         """
-        sensors, observation = self._sensors.start(self.observe(plant, goal), sample, delay)
+        truth = self._truth(plant, goal, load)
+        sensors: Any = ()
+        if self._sensors.present:
+            sensors, measured = self._sensors.start(self._measurable(truth), sample, settings)
+            truth = self._observed(measured, goal)
         integral = self.zero_integral(plant.position) if integral is None else integral
-        return LoopState(plant, integral, sensors, has_diverged(plant)), observation
+        xp, batch = plant.position.__array_namespace__(), plant.position.shape[:-1]
+        commands = xp.zeros((*batch, self._count, 3), dtype=plant.position.dtype) if self._jitters else ()
+        return LoopState(plant, integral, sensors, has_diverged(plant), commands), truth
 
     def step(
         self,
@@ -72,7 +87,7 @@ class ClosedLoop(Controllers):
         observation: Observation,
         follower: FollowerCommand,
         load: Load,
-        goals: tuple[Vector, Vector],
+        goals: tuple[Goal, Goal],
         sample: Sample,
         on_pid: Scalar | float = 1.0,
         plant_step: PlantStep | None = None,
@@ -80,20 +95,41 @@ class ClosedLoop(Controllers):
         """One control period: (state, observation at its end, commands).
 
         `follower` is the followers' answer to `observation`, in their mount frames. `goals` are those of O at the
-        beginning and the end of the period [m]. `load` includes the external force during the period; `sample` disturbs
-        the measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
+        beginning and the end of the period. `load` includes the external force during the period; `sample` disturbs the
+        measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
         (`follower.residual_on_pid`), 0 for a follower whose command is complete. `plant_step` replaces the loop's own.
         """
-        leader_sees = self._leader_body(state, observation, goals[0])
-        commands = self._commands(leader_sees, state.integral, follower, goals[0], on_pid)
-        plant = (plant_step or self._plant_step)(state.plant, self.stack(*commands), load)
+        leader_sees, goal = self._leader_body(state, observation, goals[0]), goals[0].position
+        commands = self._commands(leader_sees, state.integral, follower, goal, on_pid)
+        sent = self.stack(*commands)
+        if load.late is not None:
+            load = load._replace(last_commands=state.commands)
+        plant = (plant_step or self._plant_step)(state.plant, sent, load)
         diverged = state.diverged | has_diverged(plant)
         if not (isinstance(diverged, np.ndarray | np.generic) and not diverged.any()):
             plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
         on_pid = np.asarray(on_pid)[..., None]
-        integral = self.integrate(state.integral, leader_sees, goals[0], self._period, on_pid, commands.follower)
-        sensors, observation = self._sensors.step(state.sensors, self.observe(plant, goals[1]), sample)
-        return LoopState(plant, integral, sensors, diverged), observation, commands
+        integral = self.integrate(state.integral, leader_sees, goal, self._period, on_pid, commands.follower)
+        sensors, truth = state.sensors, self._truth(plant, goals[1], load)
+        if self._sensors.present:
+            sensors, measured = self._sensors.step(sensors, self._measurable(truth), sample)
+            truth = self._observed(measured, goals[1])
+        return LoopState(plant, integral, sensors, diverged, sent if self._jitters else ()), truth, commands
+
+    def _truth(self, plant: PlantState, goal: Goal, load: Load) -> Observation:
+        """The observation without disturbances but constant errors of the attitude."""
+        seen = self.observe(plant, goal.position, goal.rate)
+        if load.attitude_error is None:
+            return seen
+        read = self.misread(seen, load.attitude_error)
+        return read if self._sensors.object_sensor else self.observe_by(read[..., :OWN], goal.position, goal.rate)
+
+    def _measurable(self, truth: Observation) -> Array:
+        """The part of `truth` that sensors measure."""
+        return truth if self._sensors.object_sensor else truth[..., :OWN]
+
+    def _observed(self, measured: Array, goal: Goal) -> Observation:
+        return measured if self._sensors.object_sensor else self.observe_by(measured, goal.position, goal.rate)
 
     def _commands(
         self, leader_sees: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
@@ -107,9 +143,17 @@ class ClosedLoop(Controllers):
             leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, integral), follower)
         )
 
-    def _leader_body(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
-        """The body by its measurements, or the true one if `scenario.leader_uses_measurements` is off."""
-        return self.body_from_observation(observation, goal) if self._leader_measures else state.plant
+    def _leader_body(self, state: LoopState, observation: Observation, goal: Goal) -> Body:
+        """The body by its measurements, or the true one if `scenario.leader_uses_measurements` is off.
+
+        Its velocity is that relative to the goal.
+        """
+        if self._leader_measures:
+            return self.body_from_observation(observation, goal.position)
+        plant = state.plant
+        if goal.rate is None:
+            return plant
+        return BodyState(plant.position, plant.velocity - goal.rate, plant.quaternion, plant.rates)
 
 
 def _where(diverged: Bool[Array, "..."], old: Array, new: Array) -> Array:

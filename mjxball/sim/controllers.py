@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import Vector
-    from mjxball.sim.disturbances import Observation
 
+    Observation = Float[Array, "... 18"]
     Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID controller
 
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
 MAX_LIFT_DIFFERENCE = 1.5
+ATTITUDE, RATES = slice(3, 6), slice(9, 12)  # slots of an observation
 WASHOUT_TIME = 8.0  # time constant of the high pass on what a network adds to both drones' PID controller [s]
 
 
@@ -90,13 +91,13 @@ class Controllers:
         self._follower_sees = config.follower.error
         plant, followers = config.plant, list(config.plant.followers)
         mounts: Any = np.array([drone.mount for drone in plant.drones]) if parameters is None else parameters.mounts
-        self._leader, self._several = plant.leader, len(followers) > 1
+        self._leader, self._followers, self._several = plant.leader, followers, len(followers) > 1
         self._leader_mount = mounts[..., plant.leader, :]
         self._follower_mounts = mounts[..., followers if self._several else followers[0], :]
         self._mount_angles = layout.mount_angles(plant, mounts)
 
-    def observe(self, state: Body, goal: Vector) -> Observation:
-        """Observations of the followers; `goal` of O [m]."""
+    def observe(self, state: Body, goal: Vector, goal_rate: Vector | None = None) -> Observation:
+        """Observations of the followers; `goal` of O [m], and its rate [m/s] if it moves."""
         xp = state.position.__array_namespace__()
         state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
@@ -121,7 +122,50 @@ class Controllers:
             place = place[..., None, :] if self._several else place
             own = observation[..., : layout.ERROR.start]
             observation = xp.concat([own, xp.broadcast_to(place, (*own.shape[:-1], 6))], axis=-1)
-        return observation if self._mount_angles is None else rotations.turned_about_z(observation, -self._mount_angles)
+        if goal_rate is not None:
+            rate = self._along_free_axes(goal_rate)
+            rate = observation[..., layout.ERROR_RATE] + (rate[..., None, :] if self._several else rate)
+            observation = xp.concat([observation[..., : layout.ERROR_RATE.start], rate], axis=-1)
+        return self._in_mount_frames(observation)
+
+    def misread(self, observation: Observation, attitude_error: Float[Array, "... drones 3"]) -> Observation:
+        """The own states in `observation` as drones with `attitude_error` (see `Load`) estimate them."""
+        xp = observation.__array_namespace__()
+        error = attitude_error[..., self._followers if self._several else self._followers[0], :]
+        turn = error[..., 2]
+        attitude, rates = (rotations.turned_about_z(observation[..., part], -turn) for part in (ATTITUDE, RATES))
+        parts = [observation[..., :3], attitude + self._in_mount_frames(error), observation[..., 6:9], rates]
+        return xp.concat([*parts, observation[..., layout.ERROR.start :]], axis=-1)
+
+    def observe_by(self, own: Float[Array, "... 12"], goal: Vector, goal_rate: Vector | None = None) -> Observation:
+        """Observations from the followers' own measured states `own`, from which each computes the object's error.
+
+        p_O = p - R r and its rate, with R of the measured attitude; arguments else as for `observe`.
+        """
+        xp = own.__array_namespace__()
+        body = own if self._mount_angles is None else rotations.turned_about_z(own, self._mount_angles)
+        if self._free is not None:
+            rolls = xp.asarray([1.0, 0.0, 0.0], dtype=own.dtype)
+            place, velocity = (self._along_free_axes(body[..., part]) for part in (slice(0, 3), slice(6, 9)))
+            body = xp.concat([place, rolls * body[..., 3:6], velocity, rolls * body[..., 9:12]], axis=-1)
+        reference = self._follower_mounts
+        if self._follower_sees == "leader":
+            reference = reference - (self._leader_mount[..., None, :] if self._several else self._leader_mount)
+        mount = xp.asarray(reference, dtype=own.dtype)
+        matrix = rotations.matrix_from_quaternion(rotations.quaternion_from_euler(body[..., 3:6]))
+        arm = rotations.rotate(matrix, mount)
+        sweep = rotations.rotate(matrix, rotations.cross(body[..., 9:12], mount))
+        still = xp.zeros_like(goal) if goal_rate is None else goal_rate
+        if self._follower_sees == "leader":
+            goal = goal + xp.asarray(self._leader_mount, dtype=goal.dtype)
+        if self._several:
+            goal, still = goal[..., None, :], still[..., None, :]
+        errors = [goal - body[..., 0:3] + arm, still - body[..., 6:9] + sweep]
+        return self._in_mount_frames(xp.concat([body, *map(self._along_free_axes, errors)], axis=-1))
+
+    def _in_mount_frames(self, vectors: Array) -> Array:
+        """`vectors` (..., [F,] 3 k) in body axes, in the followers' mount frames."""
+        return vectors if self._mount_angles is None else rotations.turned_about_z(vectors, -self._mount_angles)
 
     def in_body_axes(self, command: Array) -> Array:
         """The followers' commands (..., 3), or (..., F, 3), from their mount frames."""

@@ -1,10 +1,9 @@
-"""Disturbances of a flight: sensor noise, estimator drift, quantization, a relayed object error, delay, external force.
+"""Disturbances of a flight: its settings, and their samples for recorded flights and for training.
 
-`SensorModel` is the model of a follower's sensors, on NumPy and JAX arrays. A `Sample` holds the disturbances of one
-control step. It is sampled beforehand from the seeds of scenarios (`record`; the same in every batch and on every
-engine), or during the flight from a JAX key (`RandomDisturbances`; training, with one key per environment). Several
-followers have separate errors, but the same delay and messages. The leader flies on the true state, or on the first
-follower's measurements with `scenario.leader_uses_measurements`.
+A `Sample` holds the disturbances of one control step. It is sampled beforehand from the seeds of scenarios (`record`;
+the same in every batch and on every engine), or during the flight from a JAX key (`RandomDisturbances`; training, with
+one key per environment). The leader flies on the true state, or on the first follower's measurements with
+`scenario.leader_uses_measurements`; constant errors of the attitude (`attitude_errors`) are those of all drones.
 """
 
 from __future__ import annotations
@@ -17,130 +16,50 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.observation import ERROR, ERROR_RATE, OBSERVATION_SIZE
+from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
+from mjxball.sim.sensors import ATTITUDE_OFFSET, DRIFT, DRIFT_TIME, NOISE, OFFSET, Sample, SensorModel, SensorSettings
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
 
     from mjxball.arrays import Array
-    from mjxball.physics.engine import Vector
 
-    Observation = Float[Array, "... 18"]
-
-# Standard deviation of each observation slot at noise level 1: motion capture and a small drone's inertial sensors.
-NOISE = np.array([*[0.003] * 3, *[0.005] * 3, *[0.02] * 3, *[0.02] * 3, *[0.003] * 3, *[0.02] * 3])
 GUST_TIME = 1.0  # [s] over which a gust is correlated
-# Slow error of each slot at level 1, a Crazyflie's estimator: position 1 mm, attitude 1 mrad, velocity 4 mm/s.
-DRIFT = np.array([*[1e-3] * 3, *[1e-3] * 3, *[4e-3] * 3, *[0.0] * 3, *[1e-3] * 3, *[4e-3] * 3])
-DRIFT_TIME = 1.0  # [s] over which it is correlated
-# Resolution of each slot in a Crazyflie's compressed state: 1 mm, 1 mm/s, 1 mrad/s, a quaternion in 32 bits.
-RESOLUTION = np.array([*[1e-3] * 3, *[2.8e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3])
-Vector3 = tuple[float, float, float]
+LONGEST_GAP = 0.5  # of the measurements [s]; gaps last between one control period and this
 
 
 @dataclass(frozen=True)
 class Disturbance:
     """Settings of the disturbances of one flight. The default is none."""
 
-    noise: float = 0.0  # standard deviations of the follower's measurements, in units of `NOISE`
-    delay: float = 0.0  # of the follower's measurements, a multiple of the control period [s]
-    relay_rate: float = 0.0  # rate at which e_o and its rate reach the follower, held in between; 0: at once [Hz]
-    relay_bias: Vector3 = (0.0, 0.0, 0.0)  # added to the relayed e_o [m]
-    relay_loss: float = 0.0  # share of the relayed messages that is lost
+    noise: float = 0.0  # standard deviations of the followers' measurements, in units of `NOISE`
+    delay: float = 0.0  # of the followers' measurements, a multiple of the control period [s]
     gust: float = 0.0  # rms of a random force on O, each axis of the world [N]
     seed: int = 0
-    estimator_drift: float = 0.0  # slow error of the follower's measurements, in units of `DRIFT`
+    estimator_drift: float = 0.0  # slow error of the followers' measurements, in units of `DRIFT`
     quantize: bool = False  # measurements arrive with the resolution `RESOLUTION`
+    offset: float = 0.0  # constant errors of each drone, in units of `OFFSET` and `ATTITUDE_OFFSET`
+    pose_lag: float = 0.0  # time constant with which measured position and velocity follow the true ones [s]
+    gap_rate: float = 0.0  # mean number of gaps in the measurements, which are held meanwhile [1/s]
+    jitter: float = 0.0  # commands take effect up to so late, a part of the control period [s]
+    object_sensor: bool = False  # the object's error has a sensor of its own instead of following from the own state
 
 
 def check_disturbance(disturbance: Disturbance, period: float) -> None:
     """Raise InputError with one sentence if `disturbance` makes no sense at a control `period` [s]."""
-    names = ("noise", "delay", "relay_rate", "gust", "estimator_drift")
+    names = ("noise", "delay", "gust", "estimator_drift", "offset", "pose_lag", "gap_rate", "jitter")
     levels = [getattr(disturbance, name) for name in names]
-    if not np.isfinite((*levels, *disturbance.relay_bias)).all():
+    if not np.isfinite(levels).all():
         raise InputError("every number of a disturbance must be finite")
     if min(levels) < 0:
-        raise InputError("noise, delay, relay rate, gust and estimator drift must not be negative")
+        raise InputError(f"{', '.join(names).replace('_', ' ')} must not be negative")
     if abs(disturbance.delay / period - round(disturbance.delay / period)) > 1e-6:
         raise InputError(f"delay must be a multiple of the control period {period:g} s, not {disturbance.delay:g} s")
-    if not 0 <= disturbance.relay_loss < 1:
-        raise InputError(f"relay loss must be at least 0 and below 1, not {disturbance.relay_loss:g}")
-
-
-class Sample(NamedTuple):
-    """Disturbances of one control step, or of all steps of a flight along a leading axis. The default is none."""
-
-    errors: tuple[Observation, ...] = ()  # added to the measurement in this order
-    received: Bool[Array, "..."] | None = None  # whether a relayed message arrives, for each observation; None: always
-    force: Vector | None = None  # external force on O in the world until the next step [N]; None: none
-
-    def at(self, number: int | slice) -> Sample:
-        """Step `number` of a flight, or a slice of its steps."""
-        errors = tuple(error[number] for error in self.errors)
-        return Sample(errors, *(None if part is None else part[number] for part in self[1:]))
-
-
-class SensorState(NamedTuple):
-    """State of the sensors between control steps; () where a disturbance is absent."""
-
-    delay: Any = ()  # (...) delay of the measurements in control steps
-    relayed: Any = ()  # (..., 6) object error and its rate as last received
-    past: Any = ()  # (longest delay + 1, ..., 18) measurements, newest first
-
-
-@dataclass(frozen=True, eq=False)
-class SensorModel:
-    """From the true observation to the measured one. Any batch shape, NumPy and JAX arrays."""
-
-    longest_delay: int = 0  # control steps
-    relay_bias: Float[np.ndarray, "... 3"] | None = None  # added to the object error [m]
-    quantized: Bool[np.ndarray, "... 1"] | bool = False  # whether measurements have the resolution `RESOLUTION`
-
-    def start(
-        self, truth: Observation, sample: Sample, delay: Int[Array, "..."] | int = 0
-    ) -> tuple[SensorState, Observation]:
-        """(state, observation) at the first step, as if the true observation had always been `truth`."""
-        xp = truth.__array_namespace__()
-        measured, relayed = self._measure(truth, sample._replace(received=None), ())
-        relayed = () if sample.received is None else relayed
-        if not self.longest_delay:
-            return SensorState((), relayed, ()), measured
-        past = xp.broadcast_to(measured, (self.longest_delay + 1, *measured.shape))
-        return SensorState(delay, relayed, past), measured
-
-    def step(self, state: SensorState, truth: Observation, sample: Sample) -> tuple[SensorState, Observation]:
-        """(state, observation) one control step later, with the true observation `truth`."""
-        xp = truth.__array_namespace__()
-        measured, relayed = self._measure(truth, sample, state.relayed)
-        relayed = () if sample.received is None else relayed
-        if not self.longest_delay:
-            return SensorState((), relayed, ()), measured
-        past = xp.concat([measured[None], state.past[:-1]], axis=0)
-        return SensorState(state.delay, relayed, past), past[(state.delay, *np.indices(truth.shape[:-1]))]
-
-    def _measure(self, truth: Observation, sample: Sample, held: Any) -> tuple[Observation, Float[Array, "... 6"]]:
-        """The measurement now (..., 18), and its object part (..., 6) before it is quantized."""
-        xp = truth.__array_namespace__()
-        for error in sample.errors:
-            truth = truth + error
-        if self.relay_bias is not None:
-            error = truth[..., ERROR] + xp.asarray(self.relay_bias, dtype=truth.dtype)
-            truth = xp.concat([truth[..., : ERROR.start], error, truth[..., ERROR_RATE]], axis=-1)
-        relayed = truth[..., ERROR.start :]
-        if sample.received is not None:
-            relayed = xp.where(sample.received[..., None], relayed, held)
-            truth = xp.concat([truth[..., : ERROR.start], relayed], axis=-1)
-        if np.any(self.quantized):
-            truth = xp.where(xp.asarray(self.quantized), quantize(truth), truth)
-        return truth, relayed
-
-
-def quantize(observation: Observation) -> Observation:
-    """`observation` rounded to the resolution in which a Crazyflie sends it."""
-    xp = observation.__array_namespace__()
-    steps = xp.asarray(RESOLUTION, dtype=observation.dtype)
-    return xp.round(observation / steps) * steps
+    if disturbance.jitter >= period:
+        raise InputError(f"jitter must be below the control period {period:g} s, not {disturbance.jitter:g} s")
+    if disturbance.gap_rate * period >= 1:
+        raise InputError(f"gap rate must be below one a control period, 1/{period:g} s, not {disturbance.gap_rate:g}/s")
 
 
 def followers_axis(config: Config) -> tuple[int, ...]:
@@ -151,26 +70,43 @@ def followers_axis(config: Config) -> tuple[int, ...]:
 
 def sensors_of(
     disturbances: Sequence[Disturbance], period: float, followers: tuple[int, ...] = ()
-) -> tuple[SensorModel, Int[np.ndarray, "n ..."]]:
-    """The sensors of n flights, and the delay of each in control steps; `followers` from `followers_axis`."""
+) -> tuple[SensorModel, SensorSettings]:
+    """The sensors of n flights and their settings; `followers` from `followers_axis`."""
     shape = (len(disturbances),) + (1,) * len(followers)
     delays = np.array([round(disturbance.delay / period) for disturbance in disturbances]).reshape(shape)
-    bias = np.array([disturbance.relay_bias for disturbance in disturbances]).reshape(*shape, 3)
+    lags = np.array([disturbance.pose_lag for disturbance in disturbances]).reshape(shape)
     quantized = np.array([disturbance.quantize for disturbance in disturbances]).reshape(*shape, 1)
-    return SensorModel(int(delays.max()), bias if bias.any() else None, quantized), delays
+    own = {disturbance.object_sensor for disturbance in disturbances}
+    if len(own) > 1:
+        raise InputError("flights of one batch must all have a sensor of the object, or none of them")
+    keep = np.exp(-period / np.maximum(lags, 1e-9)) if lags.any() else None
+    exact = (one for one in disturbances if one != Disturbance(gust=one.gust, seed=one.seed, jitter=one.jitter))
+    return SensorModel(int(delays.max()), quantized, own.pop(), any(True for _ in exact)), SensorSettings(delays, keep)
 
 
-def record(disturbances: Sequence[Disturbance], count: int, period: float, followers: tuple[int, ...] = ()) -> Sample:
+def record(
+    disturbances: Sequence[Disturbance],
+    count: int,
+    period: float,
+    followers: tuple[int, ...] = (),
+    physics_steps: int = 1,
+) -> Sample:
     """Disturbances (count, n, ...) of n flights at `count` control steps, sampled from the flights' seeds.
 
-    The first steps do not depend on `count`. `followers` from `followers_axis`.
+    The first steps do not depend on `count`. `followers` from `followers_axis`; a period has `physics_steps`.
     """
     errors = _stack([_recorded_errors(disturbance, (count, *followers), period) for disturbance in disturbances])
     received = _stack([_received(disturbance, count, period) for disturbance in disturbances])
     force = _stack([_gusts(disturbance, count, period) for disturbance in disturbances])
+    late = _stack([_late(disturbance, count, period / physics_steps) for disturbance in disturbances])
     if received is not None and followers:
         received = received[..., None]
-    return Sample(() if errors is None else (errors,), received, force)
+    return Sample(() if errors is None else (errors,), received, force, late)
+
+
+def attitude_errors(disturbance: Disturbance, drones: int) -> Float[np.ndarray, "drones 3"]:
+    """What the attitude of each drone is off: roll, pitch and the turn of its mount [rad], from the flight's seed."""
+    return disturbance.offset * ATTITUDE_OFFSET * _random(disturbance, 7).standard_normal((drones, 3))
 
 
 def _stack(tables: list[np.ndarray | None]) -> np.ndarray | None:
@@ -189,26 +125,46 @@ def _random(disturbance: Disturbance, stream: int) -> np.random.Generator:
 def _recorded_errors(
     disturbance: Disturbance, shape: tuple[int, ...], period: float
 ) -> Float[np.ndarray, "count ... 18"] | None:
-    """Noise plus estimator drift of all steps in float32, or None without either."""
-    if not (disturbance.noise or disturbance.estimator_drift):
+    """Noise, estimator drift and offsets of all steps in float32, or None without any."""
+    if not (disturbance.noise or disturbance.estimator_drift or disturbance.offset):
         return None
     white = _random(disturbance, 1).standard_normal((*shape, OBSERVATION_SIZE), np.float32)
-    slow = None
+    slow: Any = None
     if disturbance.estimator_drift:
         fresh = _random(disturbance, 4).standard_normal((*shape, OBSERVATION_SIZE))
         slow = disturbance.estimator_drift * _walk(fresh, period / DRIFT_TIME)
-    return np.sum([error.astype(np.float32) for error in measurement_errors(disturbance.noise, white, slow)], axis=0)
+    errors = [error.astype(np.float32) for error in measurement_errors(disturbance.noise, white, slow)]
+    if disturbance.offset:
+        constant = _random(disturbance, 5).standard_normal((*shape[1:], OBSERVATION_SIZE))
+        errors.append(np.broadcast_to((disturbance.offset * OFFSET * constant).astype(np.float32), white.shape))
+    return np.sum(errors, axis=0)
 
 
 def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.ndarray, " count"] | None:
-    """(count,) true at the steps where a relayed message arrives; the first one always does."""
-    if not disturbance.relay_rate:
+    """(count,) true at the steps where a measurement arrives; the first one always does."""
+    if not disturbance.gap_rate:
         return None
-    sent = np.floor(np.arange(count) * period * disturbance.relay_rate + 1e-9)
-    arrives = np.diff(sent, prepend=-1.0) > 0
-    arrives &= _random(disturbance, 2).random(count) >= disturbance.relay_loss
-    arrives[0] = True
+    begins, longs = _random(disturbance, 2).random((count, 2)).T
+    lengths = gap_steps(longs, period)
+    arrives, left = np.ones(count, bool), 0
+    for number in range(1, count):
+        left = max(left - 1, 0)
+        if not left and begins[number] < disturbance.gap_rate * period:
+            left = int(lengths[number])
+        arrives[number] = not left
     return arrives
+
+
+def gap_steps(share: Array, period: float) -> Array:
+    """Length of a gap in control steps, at least one, for a uniform random `share` in 0 to 1 of the longest."""
+    return share.__array_namespace__().ceil(share * LONGEST_GAP / period)
+
+
+def _late(disturbance: Disturbance, count: int, step: float) -> Float[np.ndarray, " count"] | None:
+    """(count,) whole physics steps of length `step` [s] by which commands are late, uniform up to the jitter."""
+    if not disturbance.jitter:
+        return None
+    return np.floor(_random(disturbance, 6).random(count) * (disturbance.jitter / step + 1))
 
 
 def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndarray, "count 3"] | None:
@@ -246,15 +202,20 @@ def measurement_errors(noise: Array | float, white: Array, drift: Array | None) 
 
 
 class RandomState(NamedTuple):
-    """State of one environment's random disturbances between control steps."""
+    """State of one environment's random disturbances between control steps; () for what is absent."""
 
     key: Array
     noise: Float[Array, ""]  # level, in units of `NOISE`
-    delay: Int[Array, ""]  # whole control steps
+    settings: SensorSettings
     gust: Float[Array, ""]  # rms of each axis of `force` [N]
     force: Float[Array, "3"]  # external force on O in the world, now [N]
-    drift: Any = ()  # (..., 18) slow error, now, in units of `DRIFT`; () if there is none
+    drift: Any = ()  # (..., 18) slow error, now, in units of `DRIFT`
     drift_level: Any = ()  # () in units of `DRIFT`
+    constant: Any = ()  # (..., 18) constant errors
+    gap_rate: Any = ()  # () [1/s]
+    gap_left: Any = ()  # () control steps of the present gap
+    jitter: Any = ()  # () [s]
+    late: Any = None  # () physics steps by which the next commands come late
 
 
 class RandomDisturbances:
@@ -262,10 +223,17 @@ class RandomDisturbances:
 
     def __init__(self, config: Config):
         scenario, self._period = config.scenario, config.timing.control_period
+        self._step = self._period / config.timing.physics_steps
         self._ranges = (scenario.noise, scenario.delay, scenario.gust)
         self._drift, self._calm = scenario.estimator_drift, scenario.calm_probability
-        self.present = any(high > 0 for _, high in (*self._ranges, self._drift)) or scenario.quantize
-        self.sensors = SensorModel(math.floor(scenario.delay[1] / self._period + 0.5), None, scenario.quantize)
+        self._offset, self._lag = scenario.offset, scenario.pose_lag
+        self._gaps, self._jitter = scenario.gap_rate, scenario.jitter
+        measured = (scenario.noise, scenario.delay, self._drift, self._offset, self._lag, self._gaps)
+        exact = not (any(high > 0 for _, high in measured) or scenario.quantize)
+        self.jitters = self._jitter[1] > 0
+        self.present = not exact or scenario.gust[1] > 0 or self.jitters
+        longest = math.floor(scenario.delay[1] / self._period + 0.5)
+        self.sensors = SensorModel(longest, scenario.quantize, scenario.object_sensor, not exact)
         self._shape = (*followers_axis(config), OBSERVATION_SIZE)
 
     def start(self, key: Array) -> tuple[Any, Sample]:
@@ -281,34 +249,60 @@ class RandomDisturbances:
         calm = random.uniform(random.fold_in(level_key, 1)) < self._calm
         noise, gust = jnp.where(calm, 0.0, noise), jnp.where(calm, 0.0, gust)
         key, noise_key, force_key = random.split(key, 3)
-        drift: Any = ()
-        level: Any = ()
-        if self._drift[1] > 0:
-            low, high = self._drift
-            level = jnp.where(calm, 0.0, low + (high - low) * random.uniform(random.fold_in(noise_key, 2)))
-            drift = level * random.normal(random.fold_in(noise_key, 3), self._shape)
+
+        def sampled(ends: tuple[float, float], stream: int) -> Array:
+            return ends[0] + (ends[1] - ends[0]) * random.uniform(random.fold_in(noise_key, stream))
+
         steps = jnp.round(delay / self._period).astype(jnp.int32)
-        state = RandomState(key, noise, steps, gust, gust * random.normal(force_key, (3,)), drift, level)
-        return state, self._sample(state, noise_key)
+        lag = jnp.where(calm, 0.0, sampled(self._lag, 4)) if self._lag[1] > 0 else None
+        keep = None if lag is None else jnp.exp(-self._period / jnp.maximum(lag, 1e-6))
+        state = RandomState(key, noise, SensorSettings(steps, keep), gust, gust * random.normal(force_key, (3,)))
+        if self._drift[1] > 0:
+            level = jnp.where(calm, 0.0, sampled(self._drift, 2))
+            slow = level * random.normal(random.fold_in(noise_key, 3), self._shape)
+            state = state._replace(drift=slow, drift_level=level)
+        if self._offset[1] > 0:
+            constant = random.normal(random.fold_in(noise_key, 6), self._shape)
+            state = state._replace(constant=sampled(self._offset, 5) * jnp.asarray(OFFSET, jnp.float32) * constant)
+        if self._gaps[1] > 0:
+            rate = jnp.where(calm, 0.0, sampled(self._gaps, 7))
+            state = state._replace(gap_rate=rate, gap_left=jnp.zeros(()))
+        if self.jitters:
+            state = state._replace(jitter=jnp.where(calm, 0.0, sampled(self._jitter, 8)))
+        return self._sampled(state, noise_key)
 
     def step(self, state: Any) -> tuple[Any, Sample]:
         """(state, sample) one control period later."""
+        from jax import numpy as jnp
         from jax import random
 
         if not self.present:
             return (), Sample()
         key, noise_key, force_key = random.split(state.key, 3)
-        drift = state.drift
         if self._drift[1] > 0:
             fresh = random.normal(random.fold_in(noise_key, 1), self._shape)
-            drift = gauss_markov(drift, fresh, self._period / DRIFT_TIME, state.drift_level)
+            state = state._replace(drift=gauss_markov(state.drift, fresh, self._period / DRIFT_TIME, state.drift_level))
+        if self._gaps[1] > 0:
+            begins, long = random.uniform(random.fold_in(noise_key, 2), (2,))
+            left = jnp.maximum(state.gap_left - 1.0, 0.0)
+            starts = (left == 0) & (begins < state.gap_rate * self._period)
+            state = state._replace(gap_left=jnp.where(starts, gap_steps(long, self._period), left))
         force = gauss_markov(state.force, random.normal(force_key, (3,)), self._period / GUST_TIME, state.gust)
-        state = state._replace(key=key, force=force, drift=drift)
-        return state, self._sample(state, noise_key)
+        return self._sampled(state._replace(key=key, force=force), noise_key)
 
-    def _sample(self, state: RandomState, key: Array) -> Sample:
+    def _sampled(self, state: RandomState, key: Array) -> tuple[RandomState, Sample]:
+        from jax import numpy as jnp
         from jax import random
 
-        white = random.normal(key, self._shape)
-        drift = state.drift if self._drift[1] > 0 else None
-        return Sample(measurement_errors(state.noise, white, drift), force=state.force)
+        errors: tuple[Any, ...] = ()
+        if self.sensors.present:
+            white = random.normal(key, self._shape)
+            errors = measurement_errors(state.noise, white, state.drift if self._drift[1] > 0 else None)
+            errors += (state.constant,) * (self._offset[1] > 0)
+        received = None
+        if self._gaps[1] > 0:
+            received = jnp.broadcast_to(state.gap_left == 0, self._shape[:-1])
+        if self.jitters:
+            share = random.uniform(random.fold_in(key, 9))
+            state = state._replace(late=jnp.floor(share * (state.jitter / self._step + 1.0)))
+        return state, Sample(errors, received)

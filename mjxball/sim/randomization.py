@@ -17,6 +17,8 @@ from mjxball.physics.step import start_state
 from mjxball.plant import PlantParameters, plant_parameters, teams
 from mjxball.plant.trim import safe_radius
 from mjxball.sim import rigs
+from mjxball.sim.goals import GoalPath
+from mjxball.sim.sensors import ATTITUDE_OFFSET
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -34,6 +36,7 @@ CEILING = float(crazyflie.THRUST_CEILING)
 MASS_CHANGE_TIME = (5.0, 15.0)  # [s]
 LOSS_TIME = (3.0, 15.0)  # [s]
 LISSAJOUS = 0.3  # probability that the CG's second sine is twice as fast, where it has one
+CIRCLE_RADIUS = (0.3, 1.0)  # of goals that move around a circle [m]
 PLACES = 16  # random waypoints of a CG before it starts over
 
 
@@ -64,6 +67,7 @@ class ResetDistribution:
         )
         self.varies = any(scale != (1.0, 1.0) for scale in scales)
         self.has_battery = scenario.battery[1] > 0
+        self.moving_goals = scenario.goal_motion_probability > 0 or scenario.goal_step_probability > 0
         plant, self._ranges = config.plant, [getattr(scenario, name) for name in teams.Factors._fields]
         self.rigs = bool(scenario.team_sizes or config.rigs.number) or any(ends != (1.0, 1.0) for ends in self._ranges)
         self._in_plane, self._several = len(plant.directions) == 2, plant.count > 2
@@ -85,7 +89,7 @@ class ResetDistribution:
         number: Int[Array, ""] | None = None,
         chosen: rigs.RigTable | None = None,
     ) -> tuple[Load, PlantState, Vector, SampledRig | None]:
-        """(load, plant nearly at rest, goal (3,) of O [m], the environment's rig if rigs are random).
+        """(load, plant nearly at rest, goal (3,) of O [m] at the start, the environment's rig if rigs are random).
 
         `number` sets the team's size; None: any of `scenario.team_sizes`. `chosen` is the rig, if given.
         """
@@ -145,7 +149,62 @@ class ResetDistribution:
             ball_offset=(self._direction(rng, 9) if self._in_plane else 1.0) * symmetric(scenario.ball_start, 1)[0],
             parameters=None if rig is None else rig.parameters,
         )
-        return load, plant, symmetric(scenario.goal_range), rig
+        goal = symmetric(scenario.goal_range)
+        load = self._with_air(load, jnp.minimum(plant.position[2], goal[2]), jax.random.fold_in(rng, 15))
+        return load, plant, goal, rig
+
+    def goal_path(self, start: Vector, key: Array) -> Any:
+        """A goal from `start` (3,) that rests, or moves along a line or around a circle, and may jump; () if all rest.
+
+        `key` is that of the reset.
+        """
+        if not self.moving_goals:
+            return ()
+        scenario, key = self.config.scenario, jax.random.fold_in(key, 14)
+        moves, circles, fast, far, side, phase, jumps, when = jax.random.uniform(key, (8,))
+        low, high = scenario.goal_speed
+        speed = jnp.where(moves < scenario.goal_motion_probability, low + (high - low) * fast, 0.0)
+        way = jax.random.normal(jax.random.fold_in(key, 1), (3,))
+        radius = CIRCLE_RADIUS[0] + (CIRCLE_RADIUS[1] - CIRCLE_RADIUS[0]) * far
+        step = jax.random.uniform(jax.random.fold_in(key, 2), (3,), minval=-0.5, maxval=0.5) * scenario.goal_range
+        around = (circles < 0.5) & (speed > 0)
+        return GoalPath(
+            start=start,
+            until=jnp.full((), jnp.inf),
+            velocity=jnp.where(around, 0.0, speed) * way / jnp.linalg.norm(way),
+            radius=jnp.where(around, radius, 0.0),
+            speed=jnp.where(side < 0.5, -1.0, 1.0) * speed / radius,
+            phase=2 * jnp.pi * phase,
+            step=step,
+            step_time=jnp.where(jumps < scenario.goal_step_probability, 5.0 + 10.0 * when, jnp.inf),
+        )
+
+    def _with_air(self, load: Load, lowest: Scalar, key: Array) -> Load:
+        """`load` with random air, attitude loops, attitude errors and fading thrust; `lowest` place of O [m]."""
+        scenario, found = self.config.scenario, dict[str, Any]()
+
+        def between(ends: tuple[float, float], stream: int) -> Scalar:
+            return ends[0] + (ends[1] - ends[0]) * jax.random.uniform(jax.random.fold_in(key, stream))
+
+        if scenario.rotor_drag[1] > 0:
+            found["rotor_drag"] = between(scenario.rotor_drag, 0)
+        if scenario.wind[1] > 0:
+            found["wind"] = between(scenario.wind, 1) * jnp.append(self._direction(key, 2), 0.0)
+        if scenario.floor_clearance[1] > 0:
+            found["floor"] = lowest - between(scenario.floor_clearance, 3)
+        if scenario.download[1] > 0:
+            found["download"] = between(scenario.download, 4)
+        if scenario.attitude_frequency[1] > 0:
+            low, high = jnp.log(jnp.array(scenario.attitude_frequency))
+            frequency = jnp.exp(low + (high - low) * jax.random.uniform(jax.random.fold_in(key, 5)))
+            found["loop_scale"] = frequency / self.config.attitude.natural_frequency[0]
+        if scenario.offset[1] > 0:
+            off = jax.random.normal(jax.random.fold_in(key, 7), (self.config.plant.count, 3))
+            found["attitude_error"] = between(scenario.offset, 6) * jnp.asarray(ATTITUDE_OFFSET, jnp.float32) * off
+        if scenario.thrust_fade[1] > 0:
+            faded = 0.0 if load.thrust_fade is None else load.thrust_fade
+            found["thrust_fade"] = faded + between(scenario.thrust_fade, 8)
+        return load._replace(**found)
 
     def _with_rig_load(self, load: Load, rig: SampledRig, key: Array) -> Load:
         """`load` with the masses, thrusts and CG reach of the row in `rig`."""

@@ -13,28 +13,33 @@ from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
-from mjxball.physics import newton_euler
-from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches, coordinates, total_wrench
+from mjxball.physics import aerodynamics, newton_euler
+from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches, coordinates
 from mjxball.physics.motion import make_cg_motion, object_mass
 from mjxball.physics.step import (
+    acting_wrench,
+    lifting,
     make_accelerations,
     make_cg_offset,
     make_numpy_plant_step,
     start_state,
-    with_external_force,
 )
 from mjxball.plant import plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
-from mjxball.sim.disturbances import Sample, SensorModel, followers_axis, record, sensors_of
+from mjxball.sim.disturbances import attitude_errors, followers_axis, record, sensors_of
+from mjxball.sim.goals import Goal, GoalMotion, GoalPath
 from mjxball.sim.scenario import CgPath, Scenario, check_scenario, of_plant
+from mjxball.sim.sensors import Sample, SensorModel, SensorSettings
 from mjxball.sim.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import Coordinates
 
+ENDS = slice(-1), slice(1, None)  # rows of the beginnings of control steps, and of their ends
+NO_FLOOR = 1e6  # [m] below the origin: of a flight without ground in a batch with
 Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
 
 
@@ -50,15 +55,20 @@ class Inputs(NamedTuple):
     """Goals and disturbances of n flights in a control step, or with a leading axis in each of T."""
 
     time: Float[Array, "..."]  # at the beginning [s]
-    goal: Float[Array, "... n 3"]  # of O at the beginning [m]
-    next_goal: Float[Array, "... n 3"]  # of O at the end [m]
+    goal: Goal  # of O at the beginning
+    next_goal: Goal  # of O at the end
     force: Float[Array, "... n 3"] | None  # external force on O meanwhile [N]; None: none
+    late: Float[Array, "... n"] | None  # physics steps by which the commands come late; None: none
     sample: Sample  # disturbances of the measurement at the end
 
     def at(self, number: int) -> Inputs:
         """Step `number`."""
-        force = None if self.force is None else self.force[number]
-        return Inputs(self.time[number], self.goal[number], self.next_goal[number], force, self.sample.at(number))
+
+        def row(part: Any) -> Any:
+            return None if part is None else part[number]
+
+        now, after = (Goal(*map(row, goal)) for goal in (self.goal, self.next_goal))
+        return Inputs(self.time[number], now, after, row(self.force), row(self.late), self.sample.at(number))
 
 
 def control_step(
@@ -77,9 +87,10 @@ def control_step(
     """
     state, seen, plant = carry.loop, carry.observation, carry.loop.plant
     memory, answer = controller.step(carry.follower, seen, privileged(plant, load))
-    acting, goals = load._replace(external_force=inputs.force), (inputs.goal, inputs.next_goal)
+    acting = load._replace(external_force=inputs.force, late=inputs.late)
+    goals = inputs.goal, inputs.next_goal
     moved, observation, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, on_pid)
-    row = Trajectory.of(plant, inputs.time, inputs.goal, commands, diverged=state.diverged, observation=seen)
+    row = Trajectory.of(plant, inputs.time, inputs.goal.position, commands, diverged=state.diverged, observation=seen)
     return Carry(moved, observation, memory), row
 
 
@@ -91,7 +102,7 @@ class ScenarioArrays(NamedTuple):
     inputs: Inputs  # of T control steps
     first: Sample  # disturbances of the first measurement
     sensors: SensorModel
-    delays: Int[np.ndarray, "n ..."]  # of the measurements, in control steps
+    settings: SensorSettings
 
 
 def scenario_arrays(config: Config, scenarios: Sequence[Scenario]) -> ScenarioArrays:
@@ -101,13 +112,15 @@ def scenario_arrays(config: Config, scenarios: Sequence[Scenario]) -> ScenarioAr
         raise InputError("scenarios of one batch must last equally long")
     period, followers = config.timing.control_period, followers_axis(config)
     steps = round(scenarios[0].seconds / period) + 1
-    target, disturbances = targets(config, scenarios, steps), [scenario.disturbance for scenario in scenarios]
-    samples = record(disturbances, steps + 1, period, followers)
-    later, force = samples.at(slice(1, None))._replace(force=None), samples.at(slice(steps)).force
+    goals, disturbances = goals_of(config, scenarios, steps), [scenario.disturbance for scenario in scenarios]
+    samples = record(disturbances, steps + 1, period, followers, config.timing.physics_steps)
+    during, later = samples.at(slice(steps)), samples.at(slice(1, None))._replace(force=None, late=None)
+    before, after = (Goal(*(part if part is None else part[rows] for part in goals)) for rows in ENDS)
     # The time is exact, so that a mass change falls on the same row for every engine.
-    inputs = Inputs(np.arange(steps) * period, target[:-1], target[1:], force, later)
+    inputs = Inputs(np.arange(steps) * period, before, after, during.force, during.late, later)
     load, start = load_of(config, scenarios), start_of(config, scenarios)
-    return ScenarioArrays(load, start, inputs, samples.at(0), *sensors_of(disturbances, period, followers))
+    first = samples.at(0)._replace(force=None, late=None)
+    return ScenarioArrays(load, start, inputs, first, *sensors_of(disturbances, period, followers))
 
 
 def simulate(
@@ -141,8 +154,9 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
     on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
     privileged = make_privileged_info(config) if not on_pid.all() else lambda *_: None
-    loop = ClosedLoop(config, make_numpy_plant_step(config, physics), flown.sensors)
-    state, observation = loop.start(flown.start, inputs.goal[0], flown.first, flown.delays)
+    plant_step = make_numpy_plant_step(config, physics)
+    loop = ClosedLoop(config, plant_step, flown.sensors, jitters=inputs.late is not None)
+    state, observation = loop.start(flown.start, inputs.at(0).goal, load, flown.first, flown.settings)
     carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
     for number in range(len(inputs.time)):
         plants.append(carry.loop.plant)
@@ -246,28 +260,39 @@ def flown_contact_wrenches(
 ) -> tuple[Float[np.ndarray, "T n drones 3"], Float[np.ndarray, "T n drones 3"]]:
     """Contact forces and torques of recorded states (T, n, ...), see `physics.engine.contact_wrenches`.
 
-    `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with a push, share the closed form.
+    `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with other forces than those of rotors
+    in free air, share the closed form.
     """
-    if physics == "mujoco" and load.external_force is None:
+    if physics == "mujoco" and load.external_force is load.rotor_drag is load.floor is load.download is None:
         from mjxball.physics.mujoco import flown_contact_wrenches as measured
 
         return measured(config, flown, load)
     constants = plant_parameters(config.plant, config.attitude)
     accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
-    wrench = total_wrench(config.plant, constants, flown.rotor_force)
-    linear, angular, _ = accelerate(flown, with_external_force(wrench, flown, load), load)
-    return contact_wrenches(config.plant, constants, flown, linear, angular)
+    wrench = acting_wrench(config.plant, constants, flown.rotor_force, flown, load)
+    linear, angular, _ = accelerate(flown, wrench, load)
+    lifted = flown._replace(rotor_force=lifting(constants, flown.rotor_force, flown, load))
+    drag = aerodynamics.drag(constants, flown, load)
+    return contact_wrenches(config.plant, constants, lifted, linear, angular, drag)
 
 
-def targets(config: Config, scenarios: Sequence[Scenario], count: int) -> Float[np.ndarray, "rows n 3"]:
-    """Goal of O, count + 1 rows, before the first control step and after each of `count`."""
+def goals_of(config: Config, scenarios: Sequence[Scenario], count: int) -> Goal:
+    """Goals of O (count + 1, n, 3) before the first control step and after each of `count`; no rate if all rest."""
     time = np.arange(count + 1) * config.timing.control_period
     target = np.empty((count + 1, len(scenarios), 3))
     for number, scenario in enumerate(of_plant(config, one) for one in scenarios):
         target[:, number] = scenario.goal
         for when, goal in scenario.waypoints:
             target[time >= when - 1e-9, number] = goal
-    return target
+    motions = [scenario.goal_motion for scenario in scenarios]
+    if all(motion == GoalMotion() for motion in motions):
+        return Goal(target)
+    velocity, until, radius, speed, phase = (
+        np.array([getattr(motion, name) for motion in motions], float) for name in GoalPath._fields[1:6]
+    )
+    path = GoalPath(0.0 * velocity, velocity, until, radius, speed, phase, 0.0 * velocity, np.full_like(until, np.inf))
+    moved = path.at(time[:, None])
+    return Goal(target + moved.position, moved.rate)
 
 
 def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
@@ -301,7 +326,24 @@ def load_of(config: Config, scenarios: Sequence[Scenario]) -> Load:
     count = max((len(scenario.thrust) for scenario in scenarios), default=0)
     if count:
         load = load._replace(thrust_scale=np.array([s.thrust or (1.0,) * count for s in scenarios], float))
+    load = load._replace(**_air_of(scenarios))
+    if any(scenario.disturbance.offset for scenario in scenarios):
+        errors = [attitude_errors(scenario.disturbance, config.plant.count) for scenario in scenarios]
+        load = load._replace(attitude_error=np.array(errors))
     if any(scenario.lost for scenario in scenarios):
         stops = [[dict(s.lost).get(number, np.inf) for number in range(config.plant.count)] for s in scenarios]
         load = load._replace(stop_time=np.array(stops, float))
     return load
+
+
+def _air_of(scenarios: Sequence[Scenario]) -> dict[str, Any]:
+    """Fields of `Load` that at least one of the scenarios sets: attitude loops, air, fading thrust."""
+    still, found = Scenario(), dict[str, Any]()
+    for name in ("loop_scale", "rotor_drag", "wind", "download", "thrust_fade"):
+        values = [getattr(scenario, name) for scenario in scenarios]
+        if any(value != getattr(still, name) for value in values):
+            found[name] = np.array(values, float)
+    floors = [-NO_FLOOR if scenario.floor is None else scenario.floor for scenario in scenarios]
+    if any(floor != -NO_FLOOR for floor in floors):
+        found["floor"] = np.array(floors, float)
+    return found

@@ -10,7 +10,10 @@ import numpy as np
 
 from mjxball.config import Config, ball_limit, cg_limit, range_of
 from mjxball.errors import InputError
-from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
+from mjxball.sim.disturbances import Disturbance, check_disturbance
+from mjxball.sim.goals import GoalMotion
+
+Vector3 = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,16 @@ class Scenario:
     start_velocity: Vector3 = (0.0, 0.0, 0.0)  # of O [m/s]
     start_tilt: tuple[float, float] = (0.0, 0.0)  # roll, pitch [rad]
     waypoints: tuple[tuple[float, Vector3], ...] = ()  # (time [s], next goal of O [m]), in order
+    goal_motion: GoalMotion = field(default_factory=GoalMotion)  # on top of goal and waypoints
     disturbance: Disturbance = field(default_factory=Disturbance)
     thrust: tuple[float, ...] = ()  # factor on every drone's rotor forces; (): 1
+    thrust_fade: float = 0.0  # share of all thrust that is lost in a second [1/s]
     lost: tuple[tuple[int, float], ...] = ()  # (number of a drone, time at which its rotors stop [s])
+    loop_scale: float = 1.0  # factor on the natural frequency of ideal attitude loops
+    rotor_drag: float = 0.0  # of a drone over its mass [1/s]
+    wind: Vector3 = (0.0, 0.0, 0.0)  # velocity of the air, felt by rotor drag [m/s]
+    floor: float | None = None  # height of the ground, for ground effect; None: no ground [m]
+    download: float = 0.0  # share of its thrust that a rotor above the object loses
 
 
 def of_plant(config: Config, scenario: Scenario) -> Scenario:
@@ -80,7 +90,7 @@ def check_scenario(config: Config, scenario: Scenario) -> Scenario:
     scenario = of_plant(config, scenario)
     if len(scenario.goal) != 3:
         raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
-    if not np.isfinite(_flat(astuple(scenario))).all():
+    if not np.isfinite(_flat(astuple(replace(scenario, goal_motion=GoalMotion(until=0.0))))).all():
         raise InputError("every number of a scenario must be finite")
     if scenario.mass <= 0:
         raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
@@ -107,6 +117,7 @@ def check_scenario(config: Config, scenario: Scenario) -> Scenario:
         raise InputError(f"ball start {ball:g} m lies beyond the end stop at {ball_limit(config.plant):.4g} m")
     _check_drones(config.plant.count, scenario)
     _check_goals(config, scenario)
+    _check_air(config, scenario)
     if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:
         raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
     return scenario
@@ -128,9 +139,27 @@ def _check_goals(config: Config, scenario: Scenario) -> None:
         if far > limit:
             raise InputError(f"goal {goal} is {far:.3g} m away, beyond d_term = {limit:g} m")
         before = goal
+    moves = scenario.goal_motion
+    if not np.isfinite((*moves.velocity, moves.radius, moves.speed, moves.phase)).all() or not moves.until >= 0:
+        raise InputError("every number of a goal's motion must be finite, and its ramp must end after the start")
     times = [time for time, _ in scenario.waypoints]
     if times != sorted(times) or any(time <= 0 for time in times):
         raise InputError("waypoints must come in order of time, after the start")
+
+
+def _check_air(config: Config, scenario: Scenario) -> None:
+    if scenario.loop_scale <= 0:
+        raise InputError(f"loop scale must be positive, not {scenario.loop_scale:g}")
+    if scenario.loop_scale != 1 and config.autopilot.kind != "ideal":
+        raise InputError("loop scale is of ideal attitude loops; a Crazyflie's gains are those of autopilot")
+    if min(scenario.rotor_drag, scenario.thrust_fade) < 0:
+        raise InputError("rotor drag and thrust fade must not be negative")
+    if scenario.thrust_fade * scenario.seconds >= 1:
+        raise InputError(f"a thrust fade of {scenario.thrust_fade:g}/s leaves no thrust after {scenario.seconds:g} s")
+    if any(scenario.wind) and not scenario.rotor_drag:
+        raise InputError("wind acts through rotor drag, which is 0")
+    if not 0 <= scenario.download < 1:
+        raise InputError(f"download must be at least 0 and below 1, not {scenario.download:g}")
 
 
 def _flat(value: Any) -> list[float]:
