@@ -289,7 +289,11 @@ def _multiply(a: Any, b: Any) -> Any:
 
 
 def _divide(a: Any, b: Any) -> Any:
-    return a if _is(a, 0) or _is(b, 1) else a / b
+    if _is(a, 0) or _is(b, 1):
+        return a
+    if jnp.issubdtype(a.dtype, jnp.integer):  # rounds to zero
+        return jax.lax.div(*jnp.broadcast_arrays(a, b))
+    return a / b
 
 
 # Operations that need no computation if an operand is the constant 0 or 1.

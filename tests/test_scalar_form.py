@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -48,13 +49,19 @@ def retyped(x: Any) -> Any:
     return x * (whole < 0), x * halves.shape[-1], (halves[:, 0] == whole % 2**16 - 2**16 * (whole % 2**16 >= 2**15)) * x
 
 
+def whole_numbers(x: Any) -> Any:
+    """Integers divided by integers, as counters of steps are."""
+    count = jnp.round(x * 10).astype(jnp.int32)
+    return x * (count // 3 % 2), x * jax.lax.div(count, jnp.int32(4))
+
+
 def looped(x: Any) -> Any:
     """A loop with inputs and outputs for each step, which stays a loop."""
     total, each = jax.lax.scan(lambda total, one: (total + one, total * one), 0.0, x)
     return total, each
 
 
-@pytest.mark.parametrize("function", [rotation, large, looped, retyped, calling])
+@pytest.mark.parametrize("function", [rotation, large, looped, retyped, calling, whole_numbers])
 def test_values_and_gradients_are_those_of_the_function(function: Any) -> None:
     points = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
 
@@ -106,10 +113,20 @@ def test_products_with_known_zeros_vanish() -> None:
     assert names.count("add") == 1
 
 
-@pytest.mark.parametrize("name", ["balance", "flight"])
-def test_a_step_of_an_environment_is_the_same(name: str) -> None:
+WORLD = {
+    **{"offset": (0.0, 1.0), "pose_lag": (0.0, 0.03), "gap_rate": (0.0, 1.0), "jitter": (0.0, 0.01)},
+    **{"rotor_drag": (0.1, 0.5), "wind": (0.0, 3.0), "floor_clearance": (0.05, 1.0), "download": (0.0, 0.2)},
+    **{"attitude_frequency": (6.0, 40.0), "thrust_fade": (0.0, 0.002), "goal_motion_probability": 0.5},
+    "goal_step_probability": 0.5,
+}
+
+
+@pytest.mark.parametrize(("name", "scenario"), [("balance", {}), ("flight", {}), ("balance", WORLD)])
+def test_a_step_of_an_environment_is_the_same(name: str, scenario: Any) -> None:
     """`balance`: disturbances, delays and a memory; `flight`: the firmware's cascade and a rolling ball."""
-    env = TransportEnv(configs.replace(configs.preset(name), "follower.recurrent_units", 0), "newton-euler")
+    config = configs.replace(configs.preset(name), "follower.recurrent_units", 0)
+    config = dataclasses.replace(config, scenario=dataclasses.replace(config.scenario, **scenario))
+    env = TransportEnv(config, "newton-euler")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
     actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (3, 3)), jnp.float32)
     whole, form = map(jax.jit, (jax.vmap(env.step), scalar_form(env.step)))

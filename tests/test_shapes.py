@@ -102,7 +102,8 @@ from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
 settings = config.preset("paper")
-disturbed = Disturbance(noise=1.0, delay=0.04, relay_rate=10.0, gust=0.1, estimator_drift=1.0, quantize=True)
+noisy = dict(noise=1.0, delay=0.04, gust=0.1, estimator_drift=1.0, quantize=True)
+disturbed = Disturbance(**noisy, gap_rate=0.5, jitter=0.01, offset=1.0, pose_lag=0.02)
 flown = [Scenario(seconds=0.1), Scenario(seconds=0.1, disturbance=disturbed, mass_changes=((0.05, 0.1),))]
 follower = make_baseline("copy", settings)
 fly_compiled(settings, follower, flown)

@@ -151,17 +151,6 @@ SUITES: tuple[Suite, ...] = (
     ),
     Suite("noise", "the follower's measurements are noisy", "noise level", _disturbed("noise", (0.5, 1.0, 2.0))),
     Suite(
-        "relay",
-        "the object's error reaches the follower as from GPS: rarely, biased, with gaps",
-        "relay",
-        (
-            Variant("10 Hz", _with(relay_rate=10.0)),
-            Variant("5 Hz", _with(relay_rate=5.0)),
-            Variant("10 Hz, 5 cm bias", _with(relay_rate=10.0, relay_bias=(0.05, 0.05, 0.05))),
-            Variant("10 Hz, half lost", _with(relay_rate=10.0, relay_loss=0.5)),
-        ),
-    ),
-    Suite(
         "leader",
         "the leader has other gains than the follower was made for",
         "leader",

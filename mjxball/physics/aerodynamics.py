@@ -1,7 +1,4 @@
-"""Forces of the air on drones: ground effect, download on the object, rotor drag in wind. All are off where absent.
-
-Ground effect and download change the force of single rotors, and act where these are; rotor drag acts on a drone.
-"""
+"""Effects of the air on drones: ground effect, download on the object below rotors, rotor drag in wind."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjxball.arrays import Array, joined
 from mjxball.control import rotations
+from mjxball.physics.engine import Air
 from mjxball.plant.rotors import RADIUS
 
 if TYPE_CHECKING:
@@ -39,8 +37,13 @@ def ground_effect(height: Array, radius: Array | float, arm: Array | float) -> A
     return 1.0 / (1.0 - images)
 
 
-def rotor_factors(parameters: PlantParameters, state: PlantState, load: Load) -> Any:
-    """Factors (..., N, 4) on all rotor forces by ground effect and download; None without either."""
+def effects(parameters: PlantParameters, state: PlantState, load: Load) -> Air:
+    """What the air does to the drones in `state`."""
+    return Air(lift(parameters, state, load), drag(parameters, state, load))
+
+
+def lift(parameters: PlantParameters, state: PlantState, load: Load) -> Any:
+    """Factors (..., N, 4) on the lift of all rotors by ground effect and download; None without either."""
     found: Any = None
     if load.floor is not None:
         matrix = rotations.matrix_from_quaternion(state.quaternion)

@@ -136,24 +136,38 @@ class Engine(NamedTuple):
     rolling: Callable[[PlantState, Wrench, Scalar, Coordinates, Vector | None], tuple[Vector, Vector, Coordinates]]
 
 
+class Air(NamedTuple):
+    """Effects of the air on the drones, see `physics.aerodynamics`; None where absent."""
+
+    lift: Float[Array, "... drones 4"] | None = None  # factor on the lift of each rotor, at the same yaw moment
+    drag: Float[Array, "... drones 3"] | None = None  # force on each drone, body axes [N]
+
+
+STILL = Air()
+
+
 def rotor_wrenches(
-    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"]
+    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], air: Air = STILL
 ) -> Float[Array, "... drones 4"]:
     """(T, tau_x, tau_y, tau_z) [N, N m] of each drone's rotors about its own centre, body axes."""
-    wrench = mixer.wrench_from_rotors(rotor_force, parameters.arm, parameters.yaw_per_thrust, plant.layout)
+    own = parameters.arm, parameters.yaw_per_thrust, plant.layout
+    wrench = mixer.wrench_from_rotors(rotor_force, *own)
+    if air.lift is not None:
+        lifted = mixer.wrench_from_rotors(air.lift * rotor_force, *own)
+        wrench = wrench.__array_namespace__().concat([lifted[..., :3], wrench[..., 3:]], axis=-1)
     return mixer.turned(wrench, parameters.yaw)
 
 
 def total_wrench(
-    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], drag: Array | None = None
+    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], air: Air = STILL
 ) -> Wrench:
     """Wrench about O of all rotors, `rotor_force` [N]: T e3 and the sum of tau_i + r_i x T_i e3 over the drones.
 
-    `drag` (..., N, 3) of the air on each drone in body axes [N] is added to its thrust T_i e3.
+    The drag of the air on a drone is added to its thrust T_i e3.
     """
-    drones = rotor_wrenches(plant, parameters, rotor_force)
+    drones = rotor_wrenches(plant, parameters, rotor_force, air)
     force = drones[..., :1] * UPWARDS
-    force = force if drag is None else force + drag
+    force = force if air.drag is None else force + air.drag
     torque = drones[..., 1:] + rotations.cross(parameters.mounts, force)
     return Wrench(force.sum(axis=-2), torque.sum(axis=-2))
 
@@ -164,12 +178,12 @@ def contact_wrenches(
     state: PlantState,
     linear: Vector,
     angular: Vector,
-    drag: Array | None = None,
+    air: Air = STILL,
 ) -> tuple[Float[Array, "... drones 3"], Float[Array, "... drones 3"]]:
     """Contact forces [N] and torques [N m] of every drone on the carrier, body axes, about each drone's own centre.
 
-    `linear` is the acceleration of O in the world [m/s2], `angular` the angular acceleration in body axes [rad/s2],
-    `drag` (..., N, 3) as in `total_wrench`, D_i:
+    `linear` is the acceleration of O in the world [m/s2], `angular` the angular acceleration in body axes [rad/s2], D_i
+    the drag of the air:
 
         F_i = T_i e3 + D_i - m_i g R^T E3 - m_i a_i,  a_i = a_b + w' x r_i + w x (w x r_i)
         tau_i = tau_rotor,i - w x I_i w - I_i w'
@@ -179,9 +193,9 @@ def contact_wrenches(
     held, rates, turning = (vector[..., None, :] for vector in (held, state.rates, angular))
     mounts, own, cross = parameters.mounts, own_inertia(parameters), rotations.cross
     lever = cross(turning, mounts) + cross(rates, cross(rates, mounts))
-    rotors = rotor_wrenches(plant, parameters, state.rotor_force)
+    rotors = rotor_wrenches(plant, parameters, state.rotor_force, air)
     force = rotors[..., :1] * UPWARDS - parameters.drone_mass[..., None] * (held + lever)
-    force = force if drag is None else force + drag
+    force = force if air.drag is None else force + air.drag
     torque = rotors[..., 1:] - cross(rates, rotations.rotate(own, rates)) - rotations.rotate(own, turning)
     return force, torque
 

@@ -155,24 +155,11 @@ def acting_wrench(
     plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], state: PlantState, load: Load
 ) -> Wrench:
     """Wrench of rotors with `rotor_force` [N], of the air, and of the external force on O."""
-    wrench = total_wrench(
-        plant,
-        parameters,
-        lifting(parameters, rotor_force, state, load),
-        aerodynamics.drag(parameters, state, load),
-    )
+    wrench = total_wrench(plant, parameters, rotor_force, aerodynamics.effects(parameters, state, load))
     if load.external_force is None:
         return wrench
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.external_force))
-
-
-def lifting(
-    parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"], state: PlantState, load: Load
-) -> Float[Array, "... drones 4"]:
-    """What rotors with `rotor_force` in free air exert [N], near the ground and above the object."""
-    factors = aerodynamics.rotor_factors(parameters, state, load)
-    return rotor_force if factors is None else factors * rotor_force
 
 
 def hover_rotor_force(

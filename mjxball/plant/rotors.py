@@ -25,14 +25,26 @@ def lever(arm: Any, layout: str) -> Any:
 
 
 def blocked_shares(plant: Plant) -> Float[np.ndarray, "drones 4"]:
-    """Share of each rotor's wake that falls on the object, a box or disc centred at O below the rotors (ours)."""
-    far, angle = np.sqrt((np.arange(16) + 0.5) / 16), 2 * np.pi * (np.arange(32) + 0.5) / 32  # equal areas
-    points = (far[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
-    half, shares = np.array(plant.object_size[:2]) / 2, np.empty((plant.count, 4))
-    for number, (drone, arm) in enumerate(zip(plant.drones, plant.of_drones("arm"), strict=True)):
-        c, s = np.cos(drone.yaw), np.sin(drone.yaw)
-        own = lever(arm, plant.layout) * np.array(PLACES[plant.layout], dtype=float) @ [[c, s], [-s, c]]
-        hit = np.array(drone.mount[:2]) + own[:, None] + WAKE * RADIUS * arm * points
-        on = np.hypot(*(hit / half).T).T <= 1 if plant.is_disc else (np.abs(hit) <= half).all(axis=-1)
-        shares[number] = on.mean(axis=-1)
-    return shares
+    """Share of each rotor's wake that falls on the object of `plant`, see `shares_on_object`."""
+    mounts, yaw = np.array([drone.mount for drone in plant.drones]), np.array([drone.yaw for drone in plant.drones])
+    half = np.array(plant.object_size[:2]) / 2
+    return shares_on_object(mounts, yaw, np.array(plant.of_drones("arm")), plant.layout, half, plant.is_disc)
+
+
+def shares_on_object(
+    mounts: np.ndarray, yaw: np.ndarray, arm: np.ndarray, layout: str, half: np.ndarray, is_disc: bool
+) -> Float[np.ndarray, "... drones 4"]:
+    """Share of each rotor's wake that falls on an object centred at O below the rotors (ours).
+
+    `mounts` (..., N, 3) [m], `yaw` (..., N) [rad], `arm` (..., N) [m]; the object is a box of half edges or an ellipse
+    of half axes `half` (..., 2) [m].
+    """
+    far, angle = np.sqrt((np.arange(6) + 0.5) / 6), 2 * np.pi * (np.arange(16) + 0.5) / 16  # equal areas
+    points = WAKE * RADIUS * (far[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
+    c, s, found = np.cos(yaw), np.sin(yaw), []
+    for x, y in lever(1.0, layout) * np.array(PLACES[layout], dtype=float):
+        rotor = mounts[..., :2] + arm[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1)
+        hit = (rotor[..., None, :] + arm[..., None, None] * points) / half[..., None, None, :]
+        on = (hit * hit).sum(axis=-1) <= 1 if is_disc else (np.abs(hit) <= 1).all(axis=-1)
+        found.append(on.mean(axis=-1))
+    return np.stack(found, axis=-1)

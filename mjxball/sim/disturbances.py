@@ -149,7 +149,7 @@ def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.nd
     arrives, left = np.ones(count, bool), 0
     for number in range(1, count):
         left = max(left - 1, 0)
-        if not left and begins[number] < disturbance.gap_rate * period:
+        if arrives[number - 1] and begins[number] < disturbance.gap_rate * period:
             left = int(lengths[number])
         arrives[number] = not left
     return arrives
@@ -174,7 +174,7 @@ def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndar
     return disturbance.gust * _walk(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
 
 
-def _walk(fresh: Float[np.ndarray, "count ..."], share: float) -> Float[np.ndarray, "count ..."]:
+def _walk(fresh: Float[np.ndarray, "count ..."], share: Any) -> Float[np.ndarray, "count ..."]:
     """All steps of `gauss_markov` driven by white noise `fresh`, whose first value is the start."""
     slow = fresh.copy()
     for number in range(1, len(fresh)):
@@ -182,13 +182,13 @@ def _walk(fresh: Float[np.ndarray, "count ..."], share: float) -> Float[np.ndarr
     return slow
 
 
-def gauss_markov(before: Array, fresh: Array, share: float, deviation: Array | float = 1.0) -> Array:
+def gauss_markov(before: Array, fresh: Array, share: Any, deviation: Array | float = 1.0) -> Array:
     """The next value of a first-order Gauss-Markov process with this standard `deviation`.
 
-    `fresh` is white noise of deviation 1; `share` is the step over the time constant.
+    `fresh` is white noise of deviation 1; `share` is the step over the time constant, of each slot or of all.
     """
-    keep = math.exp(-share)
-    return keep * before + deviation * math.sqrt(1 - keep * keep) * fresh
+    keep = np.exp(-np.asarray(share)).astype(fresh.dtype)
+    return keep * before + deviation * np.sqrt(1 - keep * keep) * fresh
 
 
 def measurement_errors(noise: Array | float, white: Array, drift: Array | None) -> tuple[Array, ...]:
@@ -285,7 +285,7 @@ class RandomDisturbances:
         if self._gaps[1] > 0:
             begins, long = random.uniform(random.fold_in(noise_key, 2), (2,))
             left = jnp.maximum(state.gap_left - 1.0, 0.0)
-            starts = (left == 0) & (begins < state.gap_rate * self._period)
+            starts = (state.gap_left == 0) & (begins < state.gap_rate * self._period)
             state = state._replace(gap_left=jnp.where(starts, gap_steps(long, self._period), left))
         force = gauss_markov(state.force, random.normal(force_key, (3,)), self._period / GUST_TIME, state.gust)
         return self._sampled(state._replace(key=key, force=force), noise_key)

@@ -18,6 +18,7 @@ from mjxball.arrays import Array
 from mjxball.config import Attitude, Config, Drone, Plant, Range
 from mjxball.control.mixer import torque_per_force
 from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, rigid_inertia
+from mjxball.plant.rotors import shares_on_object
 from mjxball.plant.trim import safe_radius
 
 # A drone of 1 kg: arm [m], inertia over mass and arm^2 about (roll, pitch, yaw); the pair's.
@@ -220,6 +221,7 @@ def _sample(config: Config, size: int, count: int, random: np.random.Generator) 
         ball_inertia_per_mass=np.stack([ball] * 3, axis=-1),
         ball_limit=length,
         gravity=None,
+        blocked=shares_on_object(mounts, 0.0 * own, alike(arm), config.plant.layout, np.stack([length] * 2, -1), True),
     )
     empty = rigid_inertia(whole(parameters, gravity))
     about = [empty[:, axis, axis] + load * ball for axis in range(3)]
@@ -309,7 +311,7 @@ def _load_shares(mounts: Array) -> Array:
 def _with_padding(parameters: PlantParameters, count: int) -> PlantParameters:
     """`parameters` padded to `count` drones; added drones have no mass, no thrust and no share of the load."""
     missing = count - parameters.size
-    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass"}
+    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass", "blocked"}
     found: dict[str, Any] = {}
     for name in (*nothing, "mounts", "arm", "yaw_per_thrust", "rotor_lag"):
         value = getattr(parameters, name)
@@ -321,7 +323,7 @@ def _with_padding(parameters: PlantParameters, count: int) -> PlantParameters:
 def unpadded(rigs: RigTable, size: int) -> RigTable:
     """`rigs`, all of `size` drones, without padding."""
     padded = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass", "mounts", "arm"}
-    padded |= {"yaw_per_thrust", "rotor_lag"}
+    padded |= {"yaw_per_thrust", "rotor_lag", "blocked"}
     cut: dict[str, Any] = {name: getattr(rigs.parameters, name)[:, :size] for name in padded}
     return rigs._replace(parameters=rigs.parameters._replace(**cut), thrust=rigs.thrust[:, :size])
 

@@ -18,7 +18,6 @@ from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches
 from mjxball.physics.motion import make_cg_motion, object_mass
 from mjxball.physics.step import (
     acting_wrench,
-    lifting,
     make_accelerations,
     make_cg_offset,
     make_numpy_plant_step,
@@ -271,9 +270,8 @@ def flown_contact_wrenches(
     accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
     wrench = acting_wrench(config.plant, constants, flown.rotor_force, flown, load)
     linear, angular, _ = accelerate(flown, wrench, load)
-    lifted = flown._replace(rotor_force=lifting(constants, flown.rotor_force, flown, load))
-    drag = aerodynamics.drag(constants, flown, load)
-    return contact_wrenches(config.plant, constants, lifted, linear, angular, drag)
+    air = aerodynamics.effects(constants, flown, load)
+    return contact_wrenches(config.plant, constants, flown, linear, angular, air)
 
 
 def goals_of(config: Config, scenarios: Sequence[Scenario], count: int) -> Goal:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
 
     from mjxball.arrays import Array
     from mjxball.physics.engine import Vector
@@ -21,15 +21,17 @@ if TYPE_CHECKING:
     Measured = Float[Array, "... slots"]  # 12, or 18 with a sensor of the object: the slots of an observation
 
 OWN = 12  # numbers of a follower's own state: position, roll, pitch, yaw, velocity, body rates
-# Standard deviation of each observation slot at noise level 1: motion capture and a small drone's inertial sensors.
-NOISE = np.array([*[0.003] * 3, *[0.005] * 3, *[0.02] * 3, *[0.02] * 3, *[0.003] * 3, *[0.02] * 3])
-# Slow error of each slot at level 1, a Crazyflie's estimator: position 1 mm, attitude 1 mrad, velocity 4 mm/s.
-DRIFT = np.array([*[1e-3] * 3, *[1e-3] * 3, *[4e-3] * 3, *[0.0] * 3, *[1e-3] * 3, *[4e-3] * 3])
-DRIFT_TIME = 1.0  # [s] over which it is correlated
-# Constant error of each slot of a drone at level 1; roll, pitch and yaw of its attitude also turn its own loops, see
-# `Load.attitude_error`, and are here 0.
-OFFSET = np.array([*[2e-3] * 3, *[0.0] * 3, *[5e-3] * 3, *[0.0] * 9])
-ATTITUDE_OFFSET = np.radians([0.1, 0.1, 0.5])  # of roll, pitch, yaw of a drone at level 1 [rad]
+# Errors at level 1 are a Crazyflie's, as `benchmarks/sensor_levels.py` finds them in public flights with motion capture
+# (docs/archive/real-flights.md), in the slots of an observation; the last six are those of a sensor of the object.
+# White noise, standard deviation: position, roll and pitch and yaw, velocity, body rates.
+NOISE = np.array([*[5e-4] * 3, 1.5e-3, 1.5e-3, 5e-4, 5e-3, 5e-3, 1e-3, 0.01, 0.01, 4e-3, *[5e-4] * 3, *[5e-3] * 3])
+# Slow errors of the estimator: standard deviation, and time over which they are correlated [s].
+DRIFT = np.array([*[1e-3] * 3, 6e-3, 6e-3, 5e-3, 0.016, 0.016, 0.01, *[0.0] * 3, *[1e-3] * 3, *[0.016] * 3])
+DRIFT_TIME = np.array([*[0.4] * 3, 1.0, 1.0, 0.3, *[0.3] * 3, *[0.3] * 3, *[0.4] * 3, *[0.3] * 3])
+# Constant errors of a drone. Those of its attitude also turn its own loops, see `Load.attitude_error`: roll and pitch
+# as found, after a calibration; yaw, by which its mount is turned, and position are what a ruler leaves (ours).
+OFFSET = np.array([*[2e-3] * 3, *[0.0] * 3, *[7e-3] * 3, *[0.0] * 9])
+ATTITUDE_OFFSET = np.radians([0.2, 0.2, 1.0])  # of roll, pitch, yaw [rad]
 # Resolution of each slot in a Crazyflie's compressed state: 1 mm, 1 mm/s, 1 mrad/s, a quaternion in 32 bits.
 RESOLUTION = np.array([*[1e-3] * 3, *[2.8e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3])
 LAGGING = np.array([*[1.0] * 3, *[0.0] * 3, *[1.0] * 3, *[0.0] * 3, *[0.0] * 6])  # slots that the pose's lag delays
@@ -52,7 +54,7 @@ class Sample(NamedTuple):
 class SensorSettings(NamedTuple):
     """Settings of the sensors that differ between flights; any batch shape."""
 
-    delay: Int[Array, "..."] | int = 0  # of the measurements, in control steps
+    delay: Any = ()  # (...) of the measurements, in control steps; () without any
     keep: Float[Array, "..."] | None = None  # share of the last pose in a lagging one, exp(-period / lag); None: 0
 
 

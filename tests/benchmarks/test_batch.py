@@ -25,7 +25,16 @@ SCENARIOS = [
     Scenario(omega=2.0, amplitude=0.1, mass=0.3, believed_mass=0.2, goal=(-1, 0.5, 0), seconds=SECONDS),
     Scenario(mass_changes=((5.0, 0.1),), start_tilt=(0.1, 0.0), waypoints=((8.0, (0.0, 0.0, 1.0)),), seconds=SECONDS),
     Scenario(disturbance=Disturbance(noise=0.5, gust=0.2, seed=1), seconds=SECONDS),
-    Scenario(disturbance=Disturbance(delay=0.04, relay_rate=10.0, relay_loss=0.3, seed=2), seconds=SECONDS),
+    Scenario(
+        loop_scale=1.4,
+        rotor_drag=0.3,
+        wind=(1.0, -1.0, 0.0),
+        floor=-0.2,
+        download=0.1,
+        thrust_fade=1e-3,
+        seconds=SECONDS,
+    ),
+    Scenario(disturbance=Disturbance(delay=0.04, gap_rate=0.5, jitter=0.01, offset=1.0, seed=2), seconds=SECONDS),
 ]
 
 

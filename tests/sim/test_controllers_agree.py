@@ -115,6 +115,10 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         lambda c, e, w, m: attitude.rotor_commands(c, e, w, m, GAINS, G, 0.12, 0.02, 5.5),
         (ACTION, EULER, normal(3), random.uniform(0.9, 1.3, WORLDS)),
     ),
+    "attitude.scaled_gains": (
+        lambda s: attitude.scaled_gains(GAINS, s).kp + attitude.scaled_gains(GAINS, s).kd,
+        (random.uniform(0.6, 4.0, WORLDS),),
+    ),
     "observation.observe": (
         observation.observe,
         (normal(3), MATRIX, normal(3), normal(3), normal(3), np.array([-0.17, 0, 0])),

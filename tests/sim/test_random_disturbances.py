@@ -15,7 +15,8 @@ from mjxball.config import Config, preset, replace
 from mjxball.env import TransportEnv
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.step import jax_repeat, make_plant_step
-from mjxball.sim.disturbances import GUST_TIME, NOISE, RandomDisturbances
+from mjxball.sim.disturbances import GUST_TIME, RandomDisturbances
+from mjxball.sim.sensors import NOISE
 
 SEEN = jnp.arange(18.0)
 STEPS = 4000
@@ -25,7 +26,7 @@ def rolled(config: Config, observations: Any, seed: int = 0) -> tuple[Any, Any]:
     """(every state of the disturbances, everything seen) where the truth is `observations` (T, 18)."""
     disturbances = RandomDisturbances(config)
     start, sample = disturbances.start(jax.random.key(seed))
-    sensors, first = disturbances.sensors.start(observations[0], sample, start.delay)
+    sensors, first = disturbances.sensors.start(observations[0], sample, start.settings)
 
     def step(carry: Any, truth: Any) -> tuple[Any, Any]:
         state, sample = disturbances.step(carry[0])
@@ -60,7 +61,7 @@ def test_a_calm_flight_has_a_delay_alone(probability: float, transport: Config) 
         quiet = np.asarray(getattr(found, name)).reshape(len(keys), -1) == 0
         np.testing.assert_array_equal(quiet, np.broadcast_to(still[:, None], quiet.shape))
         np.testing.assert_array_equal(getattr(found, name)[~still], getattr(usual, name)[~still])
-    np.testing.assert_array_equal(found.delay, usual.delay)
+    np.testing.assert_array_equal(found.settings.delay, usual.settings.delay)
     assert abs(still.mean() - probability) <= 5 * math.sqrt(probability * (1 - probability) / len(keys))
 
 
@@ -96,7 +97,7 @@ def test_every_world_draws_its_own_within_the_ranges(transport: Config) -> None:
     for values, low, high in ((drawn.noise, 0.5, 1.5), (drawn.gust, 0.1, 0.3)):
         assert low <= float(values.min()) < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < float(values.max()) <= high
-    assert set(np.asarray(drawn.delay)) == {0, 1, 2}
+    assert set(np.asarray(drawn.settings.delay)) == {0, 1, 2}
 
 
 @pytest.mark.slow

@@ -120,7 +120,11 @@ def test_engines_agree_on_a_teams_noisy_flight() -> None:
 
 
 def test_a_team_is_the_same_alone_and_in_a_batch() -> None:
-    noisy = Scenario(seconds=1, mass=0.4, disturbance=Disturbance(noise=1.0, relay_rate=10, delay=0.02, seed=5))
+    noisy = Scenario(
+        seconds=1,
+        mass=0.4,
+        disturbance=Disturbance(noise=1.0, gap_rate=0.5, jitter=0.01, offset=1.0, delay=0.02, seed=5),
+    )
     lost = Scenario(seconds=1, mass=0.4, lost=((2, 0.5),), thrust=(1.0, 0.9, 1.0, 1.0))
     batch = simulate_batch(TEAM4, [(copying(TEAM4), [lost, noisy])], "newton-euler")
     for number, scenario in enumerate((lost, noisy)):
