@@ -156,8 +156,8 @@ def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.nd
 
 
 def gap_steps(share: Array, period: float) -> Array:
-    """Length of a gap in control steps, at least one, for a uniform random `share` in 0 to 1 of the longest."""
-    return share.__array_namespace__().ceil(share * LONGEST_GAP / period)
+    """Length of a gap in control steps for a uniform random `share` in 0 to 1: one to the longest, by factor."""
+    return share.__array_namespace__().ceil((LONGEST_GAP / period) ** share - 1e-4)
 
 
 def _late(disturbance: Disturbance, count: int, step: float) -> Float[np.ndarray, " count"] | None:

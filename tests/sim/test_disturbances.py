@@ -69,11 +69,14 @@ def test_gaps_hold_the_measurement_at_their_rate_and_lengths() -> None:
     held = np.diff(seen[:, 0]) == 0
     begins = np.flatnonzero(np.diff(np.concatenate([[False], held]).astype(int)) == 1)
     lengths = np.array([np.argmin(held[first : first + 100]) for first in begins[:-1]])
-    # 1000 s: 0.5 gaps a second of those outside of gaps, lengths uniform on 1 to 25 steps; four deviations.
+    # 1000 s: 0.5 gaps a second of those outside of gaps; logarithms of lengths uniform on 1 to 25 steps, so that a gap
+    # is longer than k steps with a probability of 1 - ln k / ln 25; four deviations.
     outside = PERIOD * (~held).sum()
     assert abs(len(begins) - 0.5 * outside) < 4 * np.sqrt(0.5 * outside)
     assert lengths.max() == round(LONGEST_GAP / PERIOD)
-    assert lengths.mean() == pytest.approx(13.0, abs=4 * 7.2 / np.sqrt(len(lengths)))
+    for steps in (1, 5, 12):
+        longer = 1 - np.log(steps) / np.log(25)
+        assert np.mean(lengths > steps) == pytest.approx(longer, abs=4 * 0.5 / np.sqrt(len(lengths)))
 
 
 def test_constant_errors_have_their_deviation_and_stay() -> None:
