@@ -22,7 +22,9 @@ POSE_LAG = (0.0, 0.03)  # a position behind the gyro: 13 to 23 ms found [s]
 GAP_RATE = (0.0, 0.25)  # 11 to 22 a minute found [1/s]
 JITTER = (0.0, 0.005)  # of a laptop's period [s]
 THRUST = (0.95, 1.05)  # of a drone, as 2.5 % between flights of one and its propellers leave
-GUST = 0.2  # rms of the wind's speed over its mean, near the ground
+# rms of the wind's speed over its mean. Near the ground 0.2 with a length of 8 times the height (Dryden): at 1 m above
+# 1 rad/s as rough as 0.1 with the 1 s of `GUST_TIME`.
+GUST = 0.1
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjxball.arrays import Array, clipped
-from mjxball.config import Config, Plant
+from mjxball.config import Config, Drone, Plant
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import aerodynamics, motion
@@ -243,21 +243,47 @@ def make_jax_plant_step(config: Config, physics: str, parameters: PlantParameter
     return make_plant_step(config, make(config.plant, config.attitude, parameters), jax_repeat, parameters)
 
 
-@functools.lru_cache(maxsize=8)  # compiling takes seconds
 def _compiled_step(config: Config, physics: str) -> PlantStep:
+    parameters = plant_parameters(config.plant, config.attitude)
+    shared = physics == "newton-euler" and config.autopilot.kind == "ideal" and config.motion.kind != "waveform"
+    compiled = _compiled(_structure(config) if shared else config, physics, shared)
+
+    def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
+        import jax
+
+        with jax.enable_x64(True), on_the_host():
+            return PlantState(*compiled(parameters, state, commands, load)).each(np.asarray)
+
+    return stepper
+
+
+def _structure(config: Config) -> Config:
+    """What decides the program of a closed-form step, whose parameters are arguments: one serves plants alike."""
+    plant = config.plant
+    alike = Plant(
+        drones=(Drone(),) * plant.count,
+        leader=plant.leader,
+        layout=plant.layout,
+        stand=plant.stand,
+        cg_axis=plant.cg_axis,
+    )
+    return Config(plant=alike, timing=config.timing, motion=config.motion, autopilot=config.autopilot)
+
+
+@functools.lru_cache(maxsize=16)  # compiling takes seconds
+def _compiled(config: Config, physics: str, shared: bool) -> Any:
+    """`step(parameters, state, commands, load)` for batches; `parameters` are constants of `config` unless `shared`."""
     import jax
 
     from mjxball.xla import enable_compilation_cache
 
     enable_compilation_cache()
+
+    def step(parameters: PlantParameters, *arguments: Any) -> PlantState:
+        return make_jax_plant_step(config, physics, parameters if shared else None)(*arguments)
+
     with jax.enable_x64(True), on_the_host():
-        compiled = jax.jit(jax.vmap(make_jax_plant_step(config, physics)))
-
-    def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
-        with jax.enable_x64(True), on_the_host():
-            return PlantState(*compiled(state, commands, load)).each(np.asarray)
-
-    return stepper
+        return jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))
 
 
 def on_the_host() -> AbstractContextManager[Any]:

@@ -25,12 +25,13 @@ OWN = 12  # numbers of a follower's own state: position, roll, pitch, yaw, veloc
 # (docs/archive/real-flights.md), in the slots of an observation; the last six are those of a sensor of the object.
 # White noise, standard deviation: position, roll and pitch and yaw, velocity, body rates.
 NOISE = np.array([*[5e-4] * 3, 1.5e-3, 1.5e-3, 5e-4, 5e-3, 5e-3, 1e-3, 0.01, 0.01, 4e-3, *[5e-4] * 3, *[5e-3] * 3])
-# Slow errors of the estimator: standard deviation, and time over which they are correlated [s].
-DRIFT = np.array([*[1e-3] * 3, 6e-3, 6e-3, 5e-3, 0.016, 0.016, 0.01, *[0.0] * 3, *[1e-3] * 3, *[0.016] * 3])
+# Slow errors of the estimator: standard deviation, and time over which they are correlated [s]. Those of roll, pitch and
+# velocity grow with the speed, by 0.04 rad and 0.11 m/s per m/s, and are taken at 0.05 m/s.
+DRIFT = np.array([*[1e-3] * 3, 2e-3, 2e-3, 5e-3, 5.5e-3, 5.5e-3, 4e-3, *[0.0] * 3, *[1e-3] * 3, *[5.5e-3] * 3])
 DRIFT_TIME = np.array([*[0.4] * 3, 1.0, 1.0, 0.3, *[0.3] * 3, *[0.3] * 3, *[0.4] * 3, *[0.3] * 3])
-# Constant errors of a drone. Those of its attitude also turn its own loops, see `Load.attitude_error`: roll and pitch
-# as found, after a calibration; yaw, by which its mount is turned, and position are what a ruler leaves (ours).
-OFFSET = np.array([*[2e-3] * 3, *[0.0] * 3, *[7e-3] * 3, *[0.0] * 9])
+# Constant errors of a drone: position, of the object in the hand, and velocity at rest (ours). Those of its attitude
+# also turn its own loops, see `Load.attitude_error`: roll and pitch after a calibration, and the turn of its mount.
+OFFSET = np.array([*[2e-3] * 3, *[0.0] * 3, *[1e-3] * 3, *[0.0] * 9])
 ATTITUDE_OFFSET = np.radians([0.2, 0.2, 1.0])  # of roll, pitch, yaw [rad]
 # Resolution of each slot in a Crazyflie's compressed state: 1 mm, 1 mm/s, 1 mrad/s, a quaternion in 32 bits.
 RESOLUTION = np.array([*[1e-3] * 3, *[2.8e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3])
