@@ -104,6 +104,9 @@ class Load(NamedTuple):
     cg_shape: PathShape | None = None  # of the path in a plane; None: a sine along x
     stop_time: Float[Array, "... drones"] | None = None  # when each drone's rotors stop [s]; None: never
     thrust_fade: Scalar | None = None  # share of all rotor forces that is lost in a second [1/s]; None: none
+    loop_scale: Scalar | None = None  # factor on the natural frequency of the ideal attitude loops; None: 1
+    rotor_drag: Scalar | None = None  # of a drone over its mass [1/s], see `physics.aerodynamics`; None: none
+    wind: Vector | None = None  # velocity of the air in the world, felt by rotor drag [m/s]; None: none
 
 
 class Wrench(NamedTuple):
