@@ -10,12 +10,13 @@ from collections.abc import Callable
 
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
-from mjxball.baselines.lqg import KnownFailuresLqg, Lqg, Memoryless, OffsetFree, SlowLqg
+from mjxball.baselines.crazyflie_oracle import CrazyflieOracle
+from mjxball.baselines.lqg import Lqg
 from mjxball.baselines.mpc import Mpc
 from mjxball.baselines.observer import Observer
+from mjxball.baselines.oracle import Oracle
 from mjxball.baselines.pid import Pid
-from mjxball.baselines.reference import Oracle, Random, Stay
-from mjxball.baselines.team_lqg import TeamOffsetFree
+from mjxball.baselines.reference import Random, Stay
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Controller, Copy
 from mjxball.errors import InputError
@@ -27,16 +28,12 @@ __all__ = [
     "Adaptive",
     "Copy",
     "CrazyflieLqg",
-    "KnownFailuresLqg",
     "Lqg",
-    "Memoryless",
     "Mpc",
     "Observer",
-    "OffsetFree",
     "Oracle",
     "Pid",
     "Random",
-    "SlowLqg",
     "Stay",
     "make_baseline",
     "make_controller",
@@ -48,20 +45,23 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "copy": Copy,
     "adaptive": Adaptive,
     "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
-    "oracle": Oracle,
-    "memoryless": Memoryless,
+    "oracle": lambda config: _of_kind(config, Oracle, CrazyflieOracle),
     "pid": Pid,
     "observer": Observer,
-    "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
-    "lqg-slow": SlowLqg,
-    "lqg-offset-free": lambda config: TeamOffsetFree(config) if config.plant.is_team else OffsetFree(config),
+    "lqg": lambda config: _of_kind(config, Lqg, CrazyflieLqg),
     "mpc": Mpc,
-    "lqg-known-failures": KnownFailuresLqg,
 }
 # In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
 SUITE_BASELINES = tuple(name for name in CONTROLLERS if name not in ("lqg-known-failures", "mpc"))
 VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
 BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
+
+
+def _of_kind(
+    config: Config, ideal: Callable[[Config], Controller], firmware: Callable[[Config], Controller]
+) -> Controller:
+    """The controller for the attitude loops of `config`: ideal ones, or a Crazyflie's."""
+    return (firmware if config.autopilot.kind == "crazyflie" else ideal)(config)
 
 
 def make_controller(name: str, config: Config) -> Controller:

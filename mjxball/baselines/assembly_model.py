@@ -55,6 +55,21 @@ class AssemblyModel(NamedTuple):
         turned = observation if self.angles is None else rotations.turned_about_z(observation, self.angles)
         return turned if self.followers == 1 else turned.mean(axis=-2)
 
+    def in_body_axes(self, observation: Array) -> Array:
+        """`observation` (..., 18), of several followers (..., F, 18), in body axes; also other vectors (..., 3 k)."""
+        return observation if self.angles is None else rotations.turned_about_z(observation, self.angles)
+
+    def own(self, commands: Array) -> Array:
+        """What each follower sends, in its mount frame, of the `commands` (..., F, F, 3) that it finds for all, second.
+
+        One follower's are (..., 1, 3) and become (..., 3).
+        """
+        if self.followers == 1:
+            return self.sent(commands)
+        chosen = np.eye(self.followers, dtype=commands.dtype)[..., None]
+        mine = (commands * chosen).sum(axis=-2)
+        return mine if self.angles is None else rotations.turned_about_z(mine, -self.angles)
+
     def sent(self, commands: Array) -> Array:
         """All followers' `commands` (..., F, 3) in their mount frames; the one's of a pair without their axis."""
         own = commands[..., 0, :] if self.followers == 1 else commands
@@ -128,6 +143,7 @@ class CopiedPid:
         self._pid = controller.kp, controller.kd, controller.ki
         self._pd = copy_gains(config)
         self._band, self._period = controller.integral_error_limit, config.timing.control_period
+        self._lead = controller.integral_lead_time
 
     def start(self, observation: Array) -> Any:
         """Integral (..., 3) [m s] at the first `observation` (..., 18); () if the leader has none."""
@@ -140,7 +156,7 @@ class CopiedPid:
         error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
         band = error.__array_namespace__().asarray(self._band, dtype=error.dtype)
         command = leader.pid_command(error, rate, integral, self._pid, *self._pd[2:])
-        return integral + self._period * clipped(error, -band, band), command
+        return integral + self._period * clipped(error + self._lead * rate, -band, band), command
 
 
 def ideal_model(config: Config, name: str) -> AssemblyModel:

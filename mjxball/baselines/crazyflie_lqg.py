@@ -7,40 +7,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
-from mjxball.baselines.linear import Filter, discretise, kalman, regulator, times
+from mjxball.baselines.linear import discretise, regulator, riccati, times
 from mjxball.config import Config, ball_limit
 from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
 
-# Values with a cost of 1: states and commands of the follower in their units, and the rates of its commands.
-COSTS = {"y": 0.1, "vy": 0.5, "height": 0.1, "climb": 0.5, "rate": 3.0}
-LOAD_COST = 1e-2  # of a rolling ball's torque [N m]
-THRUST_DIFFERENCE, TILT = 0.05, 0.5  # thrust difference [N], roll command [rad]
-CHANGES = (2.0, 20.0)  # [rad/s], [m/s3]
-# Process noise of a state, as its standard deviation after one second.
-PROCESS_NOISE = {"load_rate": 0.2, "load": 1e-3, "lift": 0.02, "rate": 0.1, "vy": 0.1, "climb": 0.1}
-ROLLING_NOISE = 2e-3  # of `load_rate` if the model includes a rolling ball
-# Measured states: index in an observation, sign, standard deviation of the noise.
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+LOAD_COST = 1e-2  # of a rolling ball's torque with a cost of 1 [N m]
+ROLLING_NOISE = 2e-3  # walk of `load_rate` if the model includes a rolling ball
+POSITION_NOISE = 3e-3  # standard deviation of measured y and height, to which the others refer [m]
+# Measured states: index in an observation, sign.
 MEASURED = {
-    "y": (13, -1.0, 3e-3),
-    "vy": (16, -1.0, 2e-2),
-    "roll": (3, 1.0, 5e-3),
-    "rate": (9, 1.0, 2e-2),
-    "height": (14, -1.0, 3e-3),
-    "climb": (17, -1.0, 2e-2),
+    "y": (13, -1.0),
+    "vy": (16, -1.0),
+    "roll": (3, 1.0),
+    "rate": (9, 1.0),
+    "height": (14, -1.0),
+    "climb": (17, -1.0),
 }
-ERROR_LIMIT = 0.1  # largest error that the feedback acts on [m]
-DELAY = 0.03  # of the sensors, added to the rotors' lag [s]
+LONGEST_DELAY = 8  # control steps
 STATES = (
-    "y",  # of O [m]
+    "y",  # of the CG of all [m]
     "vy",  # [m/s]
     "roll",  # [rad]
     "rate",  # [rad/s]
@@ -54,17 +51,70 @@ STATES = (
     "load",  # disturbance torque: the ball, unequal rotors [N m]
     "load_rate",  # its rate [N m/s]
     "lift",  # disturbance force: errors of mass and thrust [N]
+    "wind",  # disturbance acceleration along y [m/s2]
 )
-LATERAL = ("y", "vy")  # states that a stand locks
-LOAD_DECAY, LOAD_RATE_DECAY = 0.02, 1.0  # assumed decay of a load or lift, and of a load's rate [1/s]
+LATERAL = ("y", "vy", "wind")  # states that a stand locks
 ROLLING = 5 / 7  # acceleration of a rolling ball over that of a sliding one
+
+
+class Costs(NamedTuple):
+    """Values with a cost of 1, and the largest error that the feedback acts on."""
+
+    y: float = 0.1  # of O [m]
+    vy: float = 0.5  # [m/s]
+    height: float = 0.1  # [m]
+    climb: float = 0.5  # [m/s]
+    rate: float = 3.0  # [rad/s]
+    thrust_difference: float = 0.05  # [N]
+    roll_change: float = 2.0  # of the roll command [rad/s]
+    vertical_change: float = 20.0  # of the vertical acceleration [m/s3]
+    error_limit: float = 0.1  # the motors have little thrust to spare [m]
+
+
+class Tuning(NamedTuple):
+    """Parameters of the controller: those of `Costs`, then walks as standard deviations after a second, and others."""
+
+    y: float = 0.1
+    vy: float = 0.5
+    height: float = 0.1
+    climb: float = 0.5
+    rate: float = 3.0
+    thrust_difference: float = 0.05
+    roll_change: float = 2.0
+    vertical_change: float = 20.0
+    error_limit: float = 0.1
+    load_rate_walk: float = 0.2
+    load_walk: float = 1e-3
+    lift_walk: float = 0.02
+    wind_walk: float = 0.1
+    rate_walk: float = 0.1
+    velocity_walk: float = 0.1
+    load_rate_time: float = 1.0  # time constants with which disturbances decay [s]
+    load_time: float = 50.0
+    lift_time: float = 50.0
+    wind_time: float = 50.0
+    velocity_noise: float = 2e-2  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 5e-3  # [rad]
+    rate_noise: float = 2e-2  # [rad/s]
+    delay: float = 3.0  # of the measurements, rounded [control steps]
+
+    @property
+    def costs(self) -> Costs:
+        """Those of the LQR."""
+        return Costs(*self[: len(Costs._fields)])
+
+    @property
+    def late(self) -> int:
+        """Delay in control steps."""
+        return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
 
 
 class LinearModel(NamedTuple):
     """x' = a x + b (follower's roll [rad], vertical acceleration [m/s2])."""
 
-    a: np.ndarray  # (n, n)
-    b: np.ndarray  # (n, 2)
+    a: Float[np.ndarray, "n n"]
+    b: Float[np.ndarray, "n 2"]
+    measured: Float[np.ndarray, "k n"]  # of O, those of `MEASURED` that the model has
     names: tuple[str, ...]  # n of `STATES`
     rate_integral_limit: float  # [rad]
     load_limit: float  # [N m]
@@ -73,12 +123,17 @@ class LinearModel(NamedTuple):
         """Indices in x of those `names` that the model has."""
         return [self.names.index(name) for name in names if name in self.names]
 
+    @property
+    def shown(self) -> list[str]:
+        """Names of the measurements."""
+        return [name for name in MEASURED if name in self.names]
 
-def linear_model(config: Config, delay: float) -> LinearModel:
-    """The model for the plant of `config`; `delay` [s] of the sensors is added to the rotors' lag."""
+
+def linear_model(config: Config, tuning: Tuning) -> LinearModel:
+    """The model for the plant of `config`, with disturbances that decay as `tuning` says."""
     plant, leader = config.plant, config.leader
     assembly, loop = assembly_model(config, "lqg"), drone_loop(config, 0)
-    lag, half = plant.rotor_lag + delay, 0.5 * float(assembly.mounts[0, 1] - assembly.mounts[1, 1])
+    lag, half = plant.rotor_lag, 0.5 * float(assembly.mounts[0, 1] - assembly.mounts[1, 1])
     n, at = len(STATES), {name: place for place, name in enumerate(STATES)}
     eye = np.eye(n)
     row = {name: eye[place] for name, place in at.items()}
@@ -86,10 +141,13 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     free = float(plant.stand == "free")
     tilt = half if leader.error == "own" else 0.0  # the leader measures its own height
     leader_height, leader_climb = row["height"] + tilt * row["roll"], row["climb"] + tilt * row["rate"]
-    leader_roll = free * (leader.kp[1] * row["y"] + leader.kd[1] * row["vy"]) / plant.gravity
     leader_vertical = leader.ki[2] * row["leader_integral"] - leader.kp[2] * leader_height - leader.kd[2] * leader_climb
 
-    a[at["y"]], a[at["vy"]] = row["vy"], -plant.gravity * row["roll"]
+    total = float(assembly.known_mass.sum()) + plant.object_mass
+    reaction = 1.0 / (plant.gravity * total)  # O is where the CG is, minus m c / M; the load's torque is -g m c
+    y, vy = row["y"] + reaction * row["load"], row["vy"] + reaction * row["load_rate"]
+    leader_roll = free * (leader.kp[1] * y + leader.kd[1] * vy) / plant.gravity
+    a[at["y"]], a[at["vy"]] = row["vy"], row["wind"] - plant.gravity * row["roll"]
     a[at["roll"]] = row["rate"]
     thrust_torque = half * (row["leader_thrust"] - row["follower_thrust"])
     a[at["rate"]] = (row["torque"] + thrust_torque + row["load"]) / assembly.inertia[0]
@@ -99,33 +157,102 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     a[at["rate_integral"]] = loop.stiffness * (leader_roll - row["roll"]) - row["rate"]
 
     a[at["height"]] = row["climb"]
-    total = float(assembly.known_mass.sum()) + plant.object_mass
     a[at["climb"]] = (row["leader_thrust"] + row["follower_thrust"] + row["lift"]) / total
     leader_slope, follower_slope = thrust_slopes(config)
     a[at["leader_thrust"]] = (leader_slope * leader_vertical - row["leader_thrust"]) / lag
     a[at["follower_thrust"]] = -row["follower_thrust"] / lag
     b[at["follower_thrust"], 1] = follower_slope / lag
-    a[at["leader_integral"]] = -leader_height
+    # The integral is of the error and its rate, `integral_lead_time` ahead.
+    a[at["leader_integral"]] = -leader_height - leader.integral_lead_time * leader_climb
 
-    a[at["load"]] = row["load_rate"] - LOAD_DECAY * row["load"]
-    a[at["lift"]] = -LOAD_DECAY * row["lift"]
+    a[at["load"]] = row["load_rate"] - row["load"] / tuning.load_time
+    a[at["lift"]], a[at["wind"]] = -row["lift"] / tuning.lift_time, -row["wind"] / tuning.wind_time
     ball = plant.moving_fraction * plant.object_mass
     if config.motion.kind == "rolling":
         a[at["load_rate"]] = ROLLING * ball * plant.gravity**2 * row["roll"]
     else:
-        a[at["load_rate"]] = -LOAD_RATE_DECAY * row["load_rate"]
+        a[at["load_rate"]] = -row["load_rate"] / tuning.load_rate_time
     names = [name for name in STATES if free or name not in LATERAL]
     indices = [at[name] for name in names]
     limit = ball * plant.gravity * ball_limit(plant) if config.motion.kind == "rolling" else math.inf
-    return LinearModel(a[np.ix_(indices, indices)], b[indices], tuple(names), loop.integral_limit, limit)
+    outputs = row | {"y": y, "vy": vy}
+    measured = np.array([outputs[name] for name in MEASURED if name in names])[:, indices]
+    return LinearModel(a[np.ix_(indices, indices)], b[indices], measured, tuple(names), loop.integral_limit, limit)
+
+
+def changes(model: LinearModel, costs: Costs, period: float) -> Float[np.ndarray, "2 n+2"]:
+    """K of the command's change -K (x, u) every control `period` [s]: the LQR of outputs and changes."""
+    n, names = len(model.names), model.names
+    a, b = np.eye(n + 2), np.zeros((n + 2, 2))
+    a[:n, :n], a[:n, n:] = discretise(model.a, model.b, period)
+    b[:n], b[n:] = a[:n, n:], np.eye(2)
+    unit, rolls = np.eye(n + 2), bool(np.isfinite(model.load_limit))
+    outputs = [
+        np.append(row, [0.0, 0.0]) / getattr(costs, name)
+        for row, name in zip(model.measured, model.shown, strict=True)
+        if name != "roll"
+    ]
+    outputs += [unit[names.index("load")] / LOAD_COST] * rolls
+    apart = unit[names.index("leader_thrust")] - unit[names.index("follower_thrust")]
+    outputs.append(apart / costs.thrust_difference)
+    cost = np.array(outputs).T @ np.array(outputs)
+    limits = costs.roll_change, costs.vertical_change
+    return regulator(a, b, cost, np.diag([(limit * period) ** -2 for limit in limits]))[0]
+
+
+class CrazyflieDesign(NamedTuple):
+    """Matrices of the controller; all may have leading axes."""
+
+    transition: Float[Array, "... n n"]
+    drive: Float[Array, "... n 2"]
+    gain: Float[Array, "... n k"]  # of the filter
+    measured: Float[Array, "... k n"]
+    now: Float[Array, "... n n"]  # state now for one at the time of the newest measurement
+    ahead: Float[Array, "... n 16"]  # and what the commands since then add, the newest first
+    sent: Float[Array, "... 9"]  # 1 for the command of that time, of the one now and the last eight
+    delay: Float[Array, "..."]  # control steps
+    change: Float[Array, "... 2 n+2"]
+    error_limit: Float[Array, "..."]
+
+
+def design(config: Config, tuning: Tuning) -> CrazyflieDesign:
+    """The controller for the plant of `config`."""
+    model, period = linear_model(config, tuning), config.timing.control_period
+    transition, drive = discretise(model.a, model.b, period)
+    walks = {"load_rate": tuning.load_rate_walk, "load": tuning.load_walk, "lift": tuning.lift_walk}
+    walks |= {
+        "wind": tuning.wind_walk,
+        "rate": tuning.rate_walk,
+        "vy": tuning.velocity_walk,
+        "climb": tuning.velocity_walk,
+    }
+    if np.isfinite(model.load_limit):
+        walks["load_rate"] = ROLLING_NOISE
+    process = np.diag([walks.get(name, 0.0) ** 2 * period for name in model.names])
+    velocity, angle, rate = tuning.velocity_noise, tuning.angle_noise, tuning.rate_noise
+    deviations = {"y": POSITION_NOISE, "vy": velocity, "roll": angle, "rate": rate, "height": POSITION_NOISE}
+    noise = np.diag([(deviations | {"climb": velocity})[name] ** 2 for name in model.shown])
+    predicted = riccati(transition.T, model.measured.T, process, noise)
+    gain = np.linalg.solve(model.measured @ predicted @ model.measured.T + noise, model.measured @ predicted).T
+    ahead, power = np.zeros((len(transition), 2 * LONGEST_DELAY)), np.eye(len(transition))
+    for number in range(tuning.late):
+        ahead[:, 2 * number : 2 * number + 2], power = power @ drive, transition @ power
+    return CrazyflieDesign(
+        *(transition, drive, gain, model.measured, power, ahead),
+        sent=np.eye(LONGEST_DELAY + 1)[tuning.late],
+        delay=np.array(float(tuning.late)),
+        change=changes(model, tuning.costs, period),
+        error_limit=np.array(tuning.error_limit),
+    )
 
 
 class LqgState(NamedTuple):
     """State of the controller between control steps."""
 
-    expected: Array  # (..., n) states of the model, see `Filter`
-    command: Array  # (..., 2) last roll [rad] and vertical acceleration [m/s2]
+    expected: Array  # (..., n) states of the model at the time of the next measurement
+    commands: Array  # (..., 16) the last eight: roll [rad] and vertical acceleration [m/s2], the newest first
     integral: Any  # (..., 3) see `CopiedPid`
+    steps: Array  # (...) so far
 
 
 class CrazyflieLqg:
@@ -133,70 +260,73 @@ class CrazyflieLqg:
 
     name = "lqg"
     needs_privileged = False
+    tuning = Tuning()
 
-    def __init__(self, config: Config):
-        if config.plant.cg_axis != "y" or config.plant.stand == "pivot":
-            raise InputError("follower 'lqg' flies two Crazyflies along y, free or on the stand with height free")
-        self._assembly = assembly_model(config, self.name)
-        self._model = linear_model(config, DELAY)
-        self._filter, self._change = design(self._model, config.timing.control_period)
-        self._pid = CopiedPid(config)
-        places = [MEASURED[name][:2] for name in MEASURED if name in self._model.names]
-        self._measurement = np.array([sign * np.eye(OBSERVATION_SIZE)[place] for place, sign in places])  # (k, 18)
-        self._limits = config.command.tilt_limit, config.command.vertical_limit
-        limits = self._model.rate_integral_limit, self._model.load_limit
-        self._state_bounds = self._bounds(("rate_integral", "load"), limits)
-        self._error_bounds = self._bounds(("y", "height"), ERROR_LIMIT)
+    def __init__(self, config: Config, tuning: Tuning | None = None):
+        self.design = design(config, tuning or self.tuning)
+        self._actuators = Actuators(config, self.name)
+        self._pid, self._model = CopiedPid(config), self._actuators.model
+        shown = [MEASURED[name] for name in self._model.shown]
+        self._measurement = np.array([sign * np.eye(OBSERVATION_SIZE)[place] for place, sign in shown])  # (k, 18)
+        self._first = np.eye(len(self._model.names))[self._model.indices(MEASURED)].T  # (n, k)
 
     def start(self, observation: Array) -> LqgState:
         """See `Controller.start`."""
-        zero = observation.__array_namespace__().zeros_like(observation[..., :2])
-        return LqgState(self._filter.start(times(self._measurement, observation)), zero, self._pid.start(observation))
+        xp = observation.__array_namespace__()
+        zero = xp.zeros_like(observation[..., 0])
+        expected = times(self._first, times(self._measurement, observation))
+        return LqgState(expected, xp.stack([zero] * 2 * LONGEST_DELAY, axis=-1), self._pid.start(observation), zero)
 
     def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
         """See `Controller.step`."""
-        xp = observation.__array_namespace__()
-        estimate = self._filter.corrected(state.expected, times(self._measurement, observation))
-        estimate = _clip(estimate, self._state_bounds)
-        near = _clip(estimate, self._error_bounds)  # the motors have too little thrust to spare for large errors
-        change = times(self._change, xp.concat([near, state.command], axis=-1))
-        command = _clip(state.command - change, self._limits)
+        xp, own = observation.__array_namespace__(), self.design
+        y = times(self._measurement, observation)
+        estimate = state.expected + times(own.gain, y - times(own.measured, state.expected))
+        estimate = self._actuators.bounded(estimate)
+        now = times(own.now, estimate) + times(own.ahead, state.commands)
+        command = self._actuators.command(now, state.commands[..., :2], own.change, own.error_limit)
+        commands = xp.concat([command, state.commands], axis=-1)
+        sent, late = (xp.asarray(part, dtype=now.dtype) for part in (own.sent, own.delay))
+        before = (xp.reshape(commands, (*commands.shape[:-1], LONGEST_DELAY + 1, 2)) * sent[..., None]).sum(axis=-2)
+        moved = times(own.transition, estimate) + times(own.drive, before)
+        # The first measurements are of the start, where nothing moves.
+        expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
         integral, copied = self._pid.step(state.integral, observation)
-        vertical = self._assembly.without_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
-        vertical = _clip(vertical, self._limits[1])
-        sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
-        return LqgState(self._filter.moved(estimate, command), command, integral), sent
-
-    def _bounds(self, names: tuple[str, ...], limits: Any) -> np.ndarray:
-        """Bounds (n,): `limits` for the states `names` that the model has, infinity for the others."""
-        bounds = np.full(len(self._model.names), np.inf)
-        bounds[self._model.indices(names)] = limits
-        return bounds
+        after = LqgState(expected, commands[..., :-2], integral, state.steps + 1.0)
+        return after, self._actuators.sent(command, copied)
 
 
-def _clip(array: Array, limit: Any) -> Array:
-    xp = array.__array_namespace__()
-    bound = xp.asarray(limit, dtype=array.dtype)
-    return xp.clip(array, -bound, bound)
+class Actuators:
+    """What follows from the state of two Crazyflies along y: bounded states, limited commands."""
 
+    def __init__(self, config: Config, name: str):
+        if config.plant.cg_axis != "y" or config.plant.stand == "pivot":
+            raise InputError(f"follower {name!r} flies two Crazyflies along y, free or on the stand with height free")
+        self.assembly, self.model = assembly_model(config, name), linear_model(config, Tuning())
+        self._limits = config.command.tilt_limit, config.command.vertical_limit
+        self._bounds = np.full(len(self.model.names), np.inf)
+        limits = {"rate_integral": self.model.rate_integral_limit, "load": self.model.load_limit}
+        self._bounds[self.model.indices(limits)] = list(limits.values())
+        self._errors = np.zeros(len(self.model.names))
+        self._errors[self.model.indices(("y", "height"))] = 1.0
 
-def design(model: LinearModel, period: float) -> tuple[Filter, np.ndarray]:
-    """(filter, gain (2, n + 2) K of the command's change -K (x, u)) for the control `period` [s]."""
-    n, names = len(model.names), model.names
-    transition, drive = discretise(model.a, model.b, period)
-    rolls = bool(np.isfinite(model.load_limit))
-    deviations = PROCESS_NOISE | ({"load_rate": ROLLING_NOISE} if rolls else {})
-    walks = {place: deviations.get(name, 0.0) ** 2 for place, name in enumerate(names)}
-    noise = {place: MEASURED[names[place]][2] for place in model.indices(MEASURED)}
+    def bounded(self, x: Array) -> Array:
+        """`x` (..., n) within what the leader's rate loop and the ball allow."""
+        xp = x.__array_namespace__()
+        bounds = xp.asarray(self._bounds, dtype=x.dtype)
+        return xp.clip(x, -bounds, bounds)
 
-    a, b = np.eye(n + 2), np.zeros((n + 2, 2))
-    a[:n, :n], a[:n, n:] = transition, drive
-    b[:n], b[n:] = a[:n, n:], np.eye(2)
-    unit = np.eye(n + 2)
-    weights = {name: 1 / COSTS[name] for name in names if name in COSTS} | ({"load": 1 / LOAD_COST} if rolls else {})
-    outputs = [weight * unit[names.index(name)] for name, weight in weights.items()]
-    outputs.append((unit[names.index("leader_thrust")] - unit[names.index("follower_thrust")]) / THRUST_DIFFERENCE)
-    outputs.append(unit[n] / TILT)
-    cost = np.array(outputs).T @ np.array(outputs)
-    change, _ = regulator(a, b, cost, np.diag([(limit * period) ** -2 for limit in CHANGES]))
-    return kalman(transition, drive, period, walks, noise), change
+    def command(self, x: Array, last: Array, change: Array, error_limit: Array) -> Array:
+        """Roll and vertical acceleration (..., 2) at `x` (..., n) after the `last`, by the gains `change`."""
+        xp = x.__array_namespace__()
+        most = xp.where(xp.asarray(self._errors > 0), xp.asarray(error_limit, dtype=x.dtype)[..., None], np.inf)
+        wanted = last - times(change, xp.concat([xp.clip(x, -most, most), last], axis=-1))
+        limits = xp.asarray(self._limits, dtype=x.dtype)
+        return xp.clip(wanted, -limits, limits)
+
+    def sent(self, command: Array, copied: Array) -> Array:
+        """Command (..., 3) of roll and vertical acceleration `command` (..., 2) and the pitch that was `copied`."""
+        xp, limit = command.__array_namespace__(), self._limits[1]
+        torque = self.assembly.on_axes(command[..., :1])
+        vertical = xp.clip(self.assembly.without_extra_lift(command[..., 1], torque), -limit, limit)
+        return xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)

@@ -1,251 +1,238 @@
-"""LQG for plants with ideal attitude loops: LQR on the motion, Kalman filters for the disturbances (ours).
+"""LQG of one follower of a plant with ideal attitude loops: a Kalman filter and an LQR of one linear model (ours).
 
-The assembly follows the sum of all drones' commands. The followers therefore command what N drones should do minus the
-leader's command, which they compute from their observation, in equal shares.
+The model (`hover_model`) has the reaction to the CG's motion, the leader's controller and disturbances: the load's
+torque, wind, errors of mass and thrust. Measurements are some control steps late; the state is predicted from there
+with the commands sent since. The assembly follows the sum of all commands. A follower therefore commands its share of
+what N drones should do minus the leader's part, and assumes that the others do the same; it uses its own measurements
+alone. Followers whose sensors disagree by constants would pull against each other for ever, hence the time constants.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from mjxball.arrays import Array
-from mjxball.baselines.assembly_model import ideal_model, pair_model
-from mjxball.baselines.linear import times
-from mjxball.baselines.motion import PAIR_INERTIA, Tuning, disturbance_filter, noise, position_gains
+from mjxball.arrays import Array, joined
+from mjxball.baselines.assembly_model import ideal_model
+from mjxball.baselines.hover_model import (
+    ACROSS,
+    ERRORS,
+    LIFT_ERROR,
+    LOAD,
+    LOAD_CURVE,
+    MEASURED,
+    RATES,
+    STATES,
+    TURN,
+    WIND,
+    HoverModel,
+    LoadModel,
+    hover_model,
+)
+from mjxball.baselines.linear import regulator, riccati, times
+from mjxball.baselines.sharing import Assumed, Sharing, Wanted, level
 from mjxball.config import Config
-from mjxball.control.followers import PrivilegedInfo, copy_gains
-from mjxball.control.observation import copy_command
-from mjxball.plant import plant_parameters
+from mjxball.control.followers import PrivilegedInfo
 
-CORRECTION_LIMIT = 0.6  # of each follower's roll and pitch against the load's torque [rad]
-LIMITS = (1.0, 0.6)  # of a command about an axis with a load torque and about another [rad]
-# QUICK reproduces an independent simulation; with delayed commands it limit-cycles. SLOW settles earliest under noise
-# and 40 ms of delay among those that settle in every case (docs/archive/training.md).
-QUICK = Tuning(position=0.25, velocity=1.0, height=0.25, climb=1.0, torque_walk=9.0, tilt_limit=0.25)
-SLOW = Tuning(position=0.15, velocity=0.6, height=0.15, climb=0.6, torque_walk=0.003)
-OFFSET_FREE = Tuning(position=0.2, velocity=0.6, height=0.2, climb=0.6, torque_walk=0.003, lift_walk=0.01)
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+POSITION_NOISE = 3e-3  # standard deviation of a measured error, to which the others refer [m]
+TILT_COST, VERTICAL_COST = 0.15, 1.0  # deviations of the mean command with a cost of 1 [rad], [m/s2]
+LONGEST_DELAY = 4  # control steps
+ROWS = 14  # of `Feedback`
 
 
-class LqrFollower:
-    """Base of `lqg` and `memoryless`, which differ in how they estimate the load's torque d."""
+class Costs(NamedTuple):
+    """What the LQR weighs, and limits of what it acts on."""
 
-    needs_privileged = False
-    name = ""
-    tuning = QUICK
-    limits: tuple[float, float] | None = LIMITS  # None: the leader's
-
-    def __init__(self, config: Config):
-        self._leader_gains = copy_gains(config)
-        self._model = model = ideal_model(config, self.name)
-        self._gains = position_gains(model, self.tuning)
-        self._position_limits = np.array([self.tuning.tilt_limit, self.tuning.tilt_limit, self.tuning.lift_limit])
-        turned, other = self.limits or (config.command.tilt_limit,) * 2
-        tilts = [turned if axis in model.axes else other for axis in (0, 1)]
-        self._torque_limits = CORRECTION_LIMIT * model.followers * np.array(model.kp)
-        self._limits = np.array([*tilts, config.command.vertical_limit])
-
-    def _desired(self, observation: Array) -> Array:
-        """Desired roll, pitch and vertical acceleration (..., 3) of the assembly."""
-        xp, (far, back) = observation.__array_namespace__(), (times(gains, observation) for gains in self._gains)
-        limit = xp.asarray(self._position_limits, dtype=far.dtype)
-        return xp.clip(far, -limit, limit) + back
-
-    def _plan(
-        self, observation: Array, desired: Array, torque: Array, lift: Array, privileged: PrivilegedInfo
-    ) -> tuple[Array, Array]:
-        """Commands (..., F, 3) for `desired` (..., 3) against a `torque` (..., A) [N m] and a `lift` (...) [m/s2].
-
-        Also the sum of what all commands ask for (..., 3), which is u of `motion`.
-
-        All followers lift alike. Each adds its share of the torque that the assembly needs and the leader does not
-        give: N attitude loops at `desired`, against the load and against unequal thrusts.
-        """
-        xp, model, count = observation.__array_namespace__(), self._model, len(self._model.own_mass)
-        kp, kd, limits, torque_limits = (
-            xp.asarray(part, dtype=observation.dtype)
-            for part in (model.kp, model.kd, self._limits, self._torque_limits)
-        )
-        thrust = self._thrust(privileged)
-        carried = model.carried(self._believed(observation, privileged))
-        factor = xp.ones_like(carried) if thrust is None else thrust
-        lifting, level = factor * carried, xp.cos(observation[..., 3]) * xp.cos(observation[..., 4])
-        led, leader_factor = copy_command(observation, *self._leader_gains), factor[..., model.leader, None]
-
-        left = self._lifted_mass(carried, privileged) * (model.gravity + desired[..., 2] - lift)
-        left = left - lifting[..., model.leader] * (model.gravity + led[..., 2])
-        vertical = xp.clip(left / model.of_followers(lifting).sum(axis=-1) - model.gravity, -limits[2], limits[2])
-        # The tilt command at which a drone's attitude loop asks for no torque.
-        rest = observation[..., 3:5] + kd / kp * observation[..., 9:11]
-        base = xp.concat([rest, vertical[..., None]], axis=-1)[..., None, :]
-        base = xp.broadcast_to(base, (*base.shape[:-2], model.followers, 3))
-        turns = self._lever_torque(led, base, lifting, level)[..., model.turned] + torque
-        torque_left = kp * (count * (desired[..., :2] - rest) - leader_factor * (led[..., :2] - rest))
-        torque_left = torque_left - xp.clip(model.on_axes(turns), -torque_limits, torque_limits)
-        wrench = xp.concat([0.0 * torque_left[..., :1], torque_left], axis=-1)
-        followed = self._limited(base, base + model.corrections(wrench, carried, thrust), carried, limits)
-
-        angles = leader_factor * led[..., :2] + (model.of_followers(factor)[..., None] * followed[..., :2]).sum(axis=-2)
-        # The filter's model has N loops at full thrust; the torque that weak drones do not give is subtracted.
-        commanded = kp * (angles + (count - factor.sum(axis=-1))[..., None] * rest)
-        turning = commanded + self._lever_torque(led, followed, lifting, level)
-        mean = (led[..., 2] + followed[..., 2].sum(axis=-1)) / count
-        return followed, xp.concat([turning, mean[..., None]], axis=-1)
-
-    def _believed(self, observation: Array, privileged: PrivilegedInfo) -> Array:
-        """Believed mass (...) of the object, shared by all drones [kg]."""
-        return self._model.of_flight(privileged.believed_mass)
-
-    def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
-        """Factors (..., N) on the drones' thrust, or None if they are unknown."""
-        return None
-
-    def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
-        """Commands `followed` (..., F, 3) clipped to the limits; at `base` (..., F, 3) rotors give no torque."""
-        return followed.__array_namespace__().clip(followed, -limits, limits)
-
-    def _lifted_mass(self, carried: Array, privileged: PrivilegedInfo) -> Array:
-        """Mass (...) that all drones lift [kg]: here the sum of those that each assumes, `carried` (..., N)."""
-        return carried.sum(axis=-1)
-
-    def _all_commands(self, led: Array, followed: Array) -> Array:
-        """Commands of all drones (..., N, 3)."""
-        place = self._model.leader
-        parts = [followed[..., :place, :], led[..., None, :], followed[..., place:, :]]
-        return led.__array_namespace__().concat(parts, axis=-2)
-
-    def _lever_torque(self, led: Array, followed: Array, lifting: Array, level: Array) -> Array:
-        """Roll and pitch torque (..., 2) about O of all thrusts minus the weights of the drones."""
-        xp, model = led.__array_namespace__(), self._model
-        own = xp.asarray(model.own_mass, dtype=led.dtype) * model.gravity
-        asked = model.gravity + self._all_commands(led, followed)[..., 2]
-        return model.lever_torque(lifting * asked / level[..., None] - own)
+    position: float = 0.16  # horizontal error with a cost of 1 [m]
+    velocity: float = 0.5  # and its rate [m/s]
+    height: float = 0.2  # vertical error with a cost of 1 [m]
+    climb: float = 0.6  # and its rate [m/s]
+    error_limit: float = 0.9  # largest horizontal error that is acted on [m]
+    tilt_limit: float = 0.3  # largest tilt that errors and rates ask for [rad]
+    height_limit: float = 0.9  # largest vertical error that is acted on [m]
+    climb_limit: float = 2.5  # largest vertical acceleration that errors and rates ask for [m/s2]
 
 
-class Memoryless(LqrFollower):
-    """d from the torque balance at standstill: N Kp (theta - theta*) + N Kd q."""
+class Tuning(NamedTuple):
+    """Parameters of the controller: those of `Costs`, and of the filter and its model."""
 
-    name = "memoryless"
+    position: float = 0.079
+    velocity: float = 0.306
+    height: float = 0.0379
+    climb: float = 0.261
+    error_limit: float = 0.499
+    tilt_limit: float = 0.331
+    height_limit: float = 0.18
+    climb_limit: float = 4.59
+    load_walk: float = 639  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
+    load_frequency: float = 1.14  # of the load's oscillation [rad/s]
+    load_time: float = 21  # time constant with which its torque is forgotten [s]
+    wind_walk: float = 0.129  # noise intensity of the wind's acceleration [(m/s2)2/s]
+    wind_time: float = 51.1  # time constant with which it is forgotten [s]
+    lift_walk: float = 0.00539  # as of the wind, of errors of mass and thrust
+    lift_time: float = 87.3
+    acceleration_walk: float = 0.0144  # of every velocity [(m/s)2/s]
+    turn_walk: float = 0.0349  # of roll and pitch rate [(rad/s)2/s]
+    velocity_noise: float = 0.0292  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 0.00194  # [rad]
+    rate_noise: float = 0.0166  # [rad/s]
+    loop_scale: float = 1.04  # assumed factor on the attitude loops' natural frequency
+    delay: float = 0.917  # of the measurements, rounded [control steps]
 
-    def start(self, observation: Array) -> Any:
-        """See `Controller.start`."""
-        return ()
+    @property
+    def costs(self) -> Costs:
+        """Those of the LQR."""
+        return Costs(*self[: len(Costs._fields)])
 
-    def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
-        """See `Controller.step`."""
-        xp, model = observation.__array_namespace__(), self._model
-        observation = model.seen(observation)
-        desired = self._desired(observation)
-        kp, kd = (xp.asarray(gain, dtype=observation.dtype) for gain in (model.kp, model.kd))
-        torque = kp * (observation[..., 3:5] - desired[..., :2]) + kd * observation[..., 9:11]
-        torque = len(model.own_mass) * torque[..., model.turned]
-        followed, _ = self._plan(observation, desired, torque, 0.0, privileged)
-        return state, model.sent(followed)
+    @property
+    def load(self) -> LoadModel:
+        """That of the disturbances."""
+        return LoadModel(self.load_frequency, self.load_time, self.wind_time, self.lift_time)
+
+    @property
+    def late(self) -> int:
+        """Delay in control steps."""
+        return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
 
 
-class Lqg(LqrFollower):
-    """d from a steady-state Kalman filter on angle, rate, d, d' and the rotors' torque about each of the load's axes.
+class Feedback(NamedTuple):
+    """The mean command of all drones as a function of the state: P clipped error + D rate, clipped, + a rest."""
 
-    With a `lift_walk` the filter also estimates an uncommanded vertical acceleration, as from an error of the mass. The
-    state (..., n) is the filter's.
-    """
+    # error of O; D times its rate; rest, which balances disturbances and damps; the leader's command; `Wanted.rest`
+    rows: Float[Array, "... 14 n"]
+    position: Float[Array, "... 3 3"]  # P
+    error_limit: Float[Array, "... 3"]  # [m]
+    limit: Float[Array, "... 3"]  # [rad], [rad], [m/s2]
+
+    def wanted(self, values: Array) -> Wanted:
+        """What all drones should do for `values` (..., 14) of `rows`."""
+        xp = values.__array_namespace__()
+        gain, most, limit = (xp.asarray(part, dtype=values.dtype) for part in self[1:])
+        far = times(gain, xp.clip(values[..., :3], -most, most)) + values[..., 3:6]
+        command = xp.clip(far, -limit, limit) + values[..., 6:9]
+        return Wanted(command, values[..., 9:12], values[..., 12:14])
+
+
+def balance(model: HoverModel, gravity: float) -> np.ndarray:
+    """(3, 22) mean command that balances the disturbances at rest, with the tilt that it takes against wind."""
+    found = np.zeros((3, STATES))
+    found[:2, 19:21] = -ACROSS.T / gravity
+    found[:2, LOAD] = -np.linalg.inv(model.commanded[:2, :2])
+    found[2, LIFT_ERROR] = -1.0
+    return found
+
+
+def feedback(model: HoverModel, costs: Costs, gravity: float) -> Feedback:
+    """The LQR of errors and rates of O and of the command's deviation from `balance`."""
+    drive, steady = model.drive @ model.commanded, balance(model, gravity)
+    outputs = np.vstack([model.error, model.error_rate])
+    weights = np.array([costs.position] * 2 + [costs.height] + [costs.velocity] * 2 + [costs.climb]) ** -2.0
+    deviation = np.diag([TILT_COST**-2, TILT_COST**-2, VERTICAL_COST**-2])
+    gains, _ = regulator(model.transition + drive @ steady, drive, outputs.T * weights @ outputs, deviation)
+    whole = steady - gains
+    position, damping = whole[:, ERRORS], whole[:, RATES] @ model.error_rate
+    rest = whole - position @ model.error - damping
+    return Feedback(
+        np.vstack([model.error, damping, rest, model.led, model.rest]),
+        position,
+        np.array([costs.error_limit, costs.error_limit, costs.height_limit]),
+        np.array([costs.tilt_limit, costs.tilt_limit, costs.climb_limit]),
+    )
+
+
+class LqgDesign(NamedTuple):
+    """Matrices of the controller; all may have leading axes."""
+
+    transition: Float[Array, "... 22 22"]  # with the leader in the loop
+    drive: Float[Array, "... 22 3"]  # of what the followers' commands ask for
+    gain: Float[Array, "... 22 10"]  # of the filter
+    measured: Float[Array, "... 10 22"]
+    feedback: Feedback  # on the state at the time of the newest measurement
+    ahead: Float[Array, "... 14 12"]  # and what the inputs since then add, the newest first
+    sent: Float[Array, "... 5"]  # 1 for the input of that time, of the one now and the last four
+    delay: Float[Array, "..."]  # control steps
+
+
+def design(config: Config, tuning: Tuning) -> LqgDesign:
+    """The controller for the plant of `config`."""
+    assembly = ideal_model(config, "lqg")
+    model = hover_model(config, assembly, tuning.load, tuning.loop_scale)
+    transition, found = model.with_leader, feedback(model, tuning.costs, assembly.gravity)
+    powers = [np.linalg.matrix_power(transition, number) for number in range(tuning.late + 1)]
+    ahead = np.zeros((ROWS, 3 * LONGEST_DELAY))
+    for number in range(tuning.late):
+        ahead[:, 3 * number : 3 * number + 3] = found.rows @ powers[number] @ model.drive
+    process, noise = noises(tuning, assembly.period)
+    predicted = riccati(transition.T, model.measured.T, process, noise)
+    innovation = model.measured @ predicted @ model.measured.T + noise
+    return LqgDesign(
+        transition=transition,
+        drive=model.drive,
+        gain=np.linalg.solve(innovation, model.measured @ predicted).T,
+        measured=model.measured,
+        feedback=found._replace(rows=found.rows @ powers[-1]),
+        ahead=ahead,
+        sent=np.eye(LONGEST_DELAY + 1)[tuning.late],
+        delay=np.array(float(tuning.late)),
+    )
+
+
+def noises(tuning: Tuning, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances of the process noise of one `period` [s] (22, 22) and of the measurements (10, 10)."""
+    walks = np.zeros(STATES)
+    walks[RATES], walks[TURN] = tuning.acceleration_walk, tuning.turn_walk
+    walks[LOAD_CURVE], walks[WIND], walks[LIFT_ERROR] = tuning.load_walk, tuning.wind_walk, tuning.lift_walk
+    deviations = [POSITION_NOISE] * 3 + [tuning.velocity_noise] * 3 + [tuning.angle_noise] * 2 + [tuning.rate_noise] * 2
+    return np.diag(walks * period), np.diag(np.square(deviations))
+
+
+class LqgState(NamedTuple):
+    """State of the controller between control steps."""
+
+    expected: Array  # (..., 22) state at the time of the next measurement
+    given: Array  # (..., 12) what the followers' last four commands asked for, the newest first
+    steps: Array  # (...) so far
+
+
+class Lqg:
+    """The controller of every follower, on its own measurements; of several, arrays are (..., F, ...)."""
 
     name = "lqg"
-    scaled = False  # whether the process noise of the load's torque scales with the inertia
+    needs_privileged = False
+    tuning = Tuning()
 
-    def __init__(self, config: Config):
-        super().__init__(config)
-        model = self._model
-        roll, pitch = (inertia / PAIR_INERTIA if self.scaled else 1.0 for inertia in model.inertia)
-        found = disturbance_filter(model, model.axes, self.tuning, noise(), (roll, pitch))
-        self._filter, self._measurement = found
+    def __init__(self, config: Config, tuning: Tuning | None = None):
+        self._model = ideal_model(config, self.name)
+        self._sharing = Sharing(config, self._model)
+        self.design = design(config, tuning or self.tuning)
+        self._over_inertia = np.linalg.inv(hover_model(config, self._model, LoadModel()).inertia)
 
-    def start(self, observation: Array) -> Array:
+    def start(self, observation: Array) -> LqgState:
         """See `Controller.start`."""
-        return self._filter.start(times(self._measurement, self._model.seen(observation)))
+        xp, zero = observation.__array_namespace__(), 0.0 * observation[..., 0]
+        measured = self._model.in_body_axes(observation)[..., list(MEASURED)]
+        unknown = [zero] * (STATES - measured.shape[-1])
+        expected = joined([*(measured[..., place] for place in range(measured.shape[-1])), *unknown])
+        return LqgState(expected, xp.stack([zero] * 3 * LONGEST_DELAY, axis=-1), zero)
 
-    def estimate(self, state: Array, observation: Array) -> tuple[Array, Array, Array]:
-        """(the filter's state (..., n), load torque (..., A) [N m], error of the lift (...) [m/s2])."""
-        x, turns = self._filter.corrected(state, times(self._measurement, observation)), 5 * len(self._model.axes)
-        return x, x[..., 3:turns:5], x[..., -1] if self.tuning.lift_walk > 0.0 else 0.0
-
-    def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
+    def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
         """See `Controller.step`."""
-        observation = self._model.seen(observation)
-        x, torque, lift = self.estimate(state, observation)
-        followed, given = self._plan(observation, self._desired(observation), torque, lift, privileged)
-        return self._filter.moved(x, given), self._model.sent(followed)
-
-
-class SlowLqg(Lqg):
-    """`lqg` with a slower filter, for noise and delay."""
-
-    name = "lqg-slow"
-    tuning = SLOW
-
-
-class OffsetFree(Lqg):
-    """`lqg` for a pair of unknown object mass: it ignores the believed mass and keeps the leader's limits."""
-
-    name = "lqg-offset-free"
-    tuning = OFFSET_FREE
-    limits = None
-
-    def __init__(self, config: Config):
-        pair_model(config, self.name)
-        super().__init__(config)
-        self._mass = config.plant.object_mass
-
-    def start(self, observation: Array) -> Array:
-        """See `Controller.start`; the filter starts one period late."""
-        found = super().start(observation)
-        return self._filter.moved(found, 0.0 * observation[..., :3])
-
-    def _believed(self, observation: Array, privileged: PrivilegedInfo) -> Array:
-        return self._mass + 0.0 * observation[..., 0]
-
-
-class KnownFailuresLqg(Lqg):
-    """`lqg` that also knows the factor on every drone's thrust, and so which have failed."""
-
-    name = "lqg-known-failures"
-    needs_privileged = True
-
-    def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
-        return None if privileged.thrust is None else self._model.of_flight(privileged.thrust, axes=1)
-
-
-class KnownRigLqg(KnownFailuresLqg):
-    """`lqg` that knows its rig and the true mass, which `config` has, but not where the CG is.
-
-    The process noise of the load's torque scales with the assembly's inertia, so that one tuning serves rigs of all
-    sizes. No command asks rotors for more torque than they have.
-    """
-
-    name = "lqg-known-rig"
-    scaled = True
-
-    def __init__(self, config: Config):
-        super().__init__(config)
-        parameters, followers = plant_parameters(config.plant, config.attitude), list(config.plant.followers)
-        self._rotors = parameters.arm[followers], parameters.rotor_force_max[followers]
-
-    def _lifted_mass(self, carried: Array, privileged: PrivilegedInfo) -> Array:
-        return self._model.of_flight(privileged.total_mass)
-
-    def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
-        xp = followed.__array_namespace__()
-        kp, arm, most = (xp.asarray(part, dtype=followed.dtype) for part in (self._model.kp, *self._rotors))
-        hover = self._model.of_followers(carried) * (self._model.gravity + followed[..., 2]) / 4
-        room = 2 * arm * xp.maximum(xp.minimum(hover, most - hover), 0.1 * most)
-        reach = 0.95 * room[..., None] / kp
-        tilts = base[..., :2] + xp.clip(followed[..., :2] - base[..., :2], -reach, reach)
-        return xp.clip(xp.concat([tilts, followed[..., 2:]], axis=-1), -limits, limits)
-
-
-class SlowKnownRigLqg(KnownRigLqg):
-    """`lqg-known-rig` with the tuning of `lqg-slow`."""
-
-    name = "lqg-slow-known-rig"
-    tuning = SLOW
+        xp, own, model = observation.__array_namespace__(), self.design, self._model
+        seen = model.in_body_axes(observation)
+        y = seen[..., list(MEASURED)]
+        x = state.expected + times(own.gain, y - times(own.measured, state.expected))
+        carried = model.carried(privileged.believed_mass)
+        wanted = own.feedback.wanted(times(own.feedback.rows, x) + times(own.ahead, state.given))
+        commands, asked = self._sharing(wanted, Assumed(carried, carried.sum(axis=-1), level(seen)))
+        asked = xp.concat([times(self._over_inertia, asked[..., :2]), asked[..., 2:]], axis=-1)
+        given = xp.concat([asked, state.given], axis=-1)
+        sent, late = (xp.asarray(part, dtype=x.dtype) for part in (own.sent, own.delay))
+        before = (xp.reshape(given, (*given.shape[:-1], LONGEST_DELAY + 1, 3)) * sent[..., None]).sum(axis=-2)
+        moved = times(own.transition, x) + times(own.drive, before)
+        # The first measurements are of the start, where nothing moves.
+        expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
+        return LqgState(expected, given[..., :-3], state.steps + 1.0), model.own(commands)

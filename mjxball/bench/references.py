@@ -7,13 +7,10 @@ import functools
 import numpy as np
 
 from mjxball.baselines import make_baseline
-from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
 from mjxball.bench.success import bar, numbers
 from mjxball.bench.tracks import worlds_of
 from mjxball.config import Config
 from mjxball.control.followers import Baseline
-
-KNOWN_RIG = {controller.name: controller for controller in (KnownRigLqg, SlowKnownRigLqg)}
 
 
 @functools.cache
@@ -30,4 +27,4 @@ def bars(track: str, draw: int, number: int) -> np.ndarray:
 
 def reference(name: str, config: Config) -> Baseline:
     """The reference called `name`, made for the plant of `config`."""
-    return Baseline(KNOWN_RIG[name](config), config) if name in KNOWN_RIG else make_baseline(name, config)
+    return make_baseline(name, config)

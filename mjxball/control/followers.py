@@ -19,8 +19,8 @@ MAX_OBSERVATION = 1e6
 class PrivilegedInfo(NamedTuple):
     """Simulator state that an observation does not contain; every leaf has the observation's batch shape.
 
-    Any follower may read `believed_mass`. The other fields are ground truth for followers with `needs_privileged`
-    alone; those of the load are half a control step and one rotor lag ahead.
+    Any follower may read `believed_mass`. The other fields are the present truth, for followers with `needs_privileged`
+    alone.
     """
 
     believed_mass: Array  # (...) mass of the object that the hover thrust assumes [kg]
@@ -29,6 +29,11 @@ class PrivilegedInfo(NamedTuple):
     moment_acceleration: Array  # likewise, object mass x second derivative of the CG offset [kg m/s2]
     total_mass: Array  # (...) of the assembly [kg]
     thrust: Array | None = None  # (..., N) present factor on each drone's rotor forces; None: 1
+    moment_rate: Array = None  # as `moment`, object mass x rate of the CG offset [kg m/s]
+    rotors: Array = None  # (..., N, 3) lift [N], roll and pitch torque [N m] of each drone's rotors, body axes
+    force: Array | None = None  # (..., 3) of wind and pushes on the assembly, in the axes of the observation [N]
+    loop_scale: Array | None = None  # (...) factor on the attitude loops' natural frequency; None: 1
+    loops: Array = None  # (..., N, 13) of Crazyflies, see `control.crazyflie.Loops`
 
 
 class Controller(Protocol):

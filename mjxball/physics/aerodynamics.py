@@ -10,7 +10,7 @@ from mjxball.physics.engine import Air
 from mjxball.plant.rotors import RADIUS
 
 if TYPE_CHECKING:
-    from mjxball.physics.engine import Load, PlantState, Vector
+    from mjxball.physics.engine import Load, PlantState
     from mjxball.plant import PlantParameters
 
 BODY_LIFT = 2.0  # K_b of Sanchez-Cuevas et al. 2017: what the air that rises between the rotors adds
@@ -73,9 +73,8 @@ def drag(parameters: PlantParameters, state: PlantState, load: Load) -> Any:
     return joined([x, y, 0.0 * x])
 
 
-def wind_force(parameters: PlantParameters, load: Load, state: PlantState) -> Vector:
-    """What rotor drag exerts on the whole assembly, (..., 3) in the world [N]; 0 without drag."""
-    found = drag(parameters, state, load)
-    if found is None:
-        return 0.0 * state.velocity
-    return rotations.rotate(rotations.matrix_from_quaternion(state.quaternion), found.sum(axis=-2))
+def drag_force(air: Air, state: PlantState) -> Any:
+    """The drag of all drones on the assembly in the world, (..., 3) [N]; None without."""
+    if air.drag is None:
+        return None
+    return rotations.rotate(rotations.matrix_from_quaternion(state.quaternion), air.drag.sum(axis=-2))

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import joined
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import aerodynamics, newton_euler
-from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches, coordinates
+from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches, coordinates, rotor_wrenches
 from mjxball.physics.motion import make_cg_motion, object_mass
 from mjxball.physics.step import (
     acting_wrench,
@@ -24,6 +25,7 @@ from mjxball.physics.step import (
     start_state,
 )
 from mjxball.plant import plant_parameters
+from mjxball.plant.parameters import rigid_mass
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import attitude_errors, followers_axis, record, sensors_of
 from mjxball.sim.goals import Goal, GoalMotion, GoalPath
@@ -85,9 +87,9 @@ def control_step(
     `on_pid` as of `ClosedLoop.step`.
     """
     state, seen, plant = carry.loop, carry.observation, carry.loop.plant
-    memory, answer = controller.step(carry.follower, seen, privileged(plant, load))
     acting = load._replace(external_force=inputs.force, late=inputs.late)
     goals = inputs.goal, inputs.next_goal
+    memory, answer = controller.step(carry.follower, seen, privileged(plant, acting))
     moved, observation, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, on_pid)
     row = Trajectory.of(plant, inputs.time, inputs.goal.position, commands, diverged=state.diverged, observation=seen)
     return Carry(moved, observation, memory), row
@@ -210,46 +212,68 @@ class _Together:
 
 
 def make_privileged_info(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
-    """Return `privileged(state, load)`: what a classical follower gets, the truth half a step and a rotor lag ahead.
+    """Return `privileged(state, load)`: the present truth for a classical follower.
 
-    Of a rolling ball nobody can know the future: the oracle gets where it is.
+    Of a freely rolling ball the acceleration is taken for 0.
     """
-    plant = config.plant
+    plant, params = config.plant, plant_parameters(config.plant, config.attitude)
     angles, several = mount_angles(plant), len(plant.followers) > 1
-    ahead = 0.5 * config.timing.control_period + plant.rotor_lag
-    drones = sum(drone.mass for drone in plant.drones) + plant.carrier_mass
+    drones = float(rigid_mass(params))
     prescribed = None if config.motion.kind == "rolling" else make_cg_motion(config)
 
+    def each(value: Array, axes: int = 0) -> Array:
+        """`value` of a flight, whose last `axes` are not the batch's, for each of its followers."""
+        if not several:
+            return value
+        xp, place = value.__array_namespace__(), value.ndim - axes
+        shape = (*value.shape[:place], len(plant.followers), *value.shape[place:])
+        return xp.broadcast_to(xp.expand_dims(value, axis=place), shape)
+
+    def in_frames(vector: Array) -> Array:
+        """A vector (..., 3) in body axes in those of each follower's observation."""
+        found = each(vector, axes=1)
+        return found if angles is None else rotations.turned_about_z(found, -angles)
+
+    def moment(mass: Array, found: Coordinates) -> Array:
+        along = coordinates(found, len(plant.directions))
+        if angles is None:
+            return mass * along[0]
+        parts = [mass * along[plant.directions.index(k)] if k in plant.directions else 0.0 * mass for k in (0, 1)]
+        return in_frames(joined([*parts, 0.0 * mass]))[..., :2]
+
     def privileged(state: PlantState, load: Load) -> PrivilegedInfo:
-        xp = state.time.__array_namespace__()
-        mass = object_mass(state.time, load)
+        xp, mass = state.time.__array_namespace__(), object_mass(state.time, load)
         if prescribed is None:
-            offset, acceleration = plant.moving_fraction * state.ball_offset, xp.zeros_like(state.ball_offset)
+            share, ball = plant.moving_fraction, state.ball_offset
+            offset, rate, acceleration = share * ball, share * state.ball_rate, xp.zeros_like(ball)
         else:
-            offset, _, acceleration = prescribed(state.time + ahead, load)
-
-        def each(value: Array, axes: int = 0) -> Array:
-            """`value` of a flight, whose last `axes` are not the batch's, for each of its followers."""
-            if not several:
-                return value
-            place = value.ndim - axes
-            shape = (*value.shape[:place], len(plant.followers), *value.shape[place:])
-            return xp.broadcast_to(xp.expand_dims(value, axis=place), shape)
-
-        def moment(found: Coordinates) -> Array:
-            along = coordinates(found, len(plant.directions))
-            if angles is None:
-                return mass * along[0]
-            parts = [mass * along[plant.directions.index(k)] if k in plant.directions else 0.0 * mass for k in (0, 1)]
-            flat = each(xp.stack([*parts, 0.0 * mass], axis=-1), axes=1)
-            return rotations.turned_about_z(flat, -angles)[..., :2]
-
+            offset, rate, acceleration = prescribed(state.time, load)
         thrust = load.thrust_scale
         if load.stop_time is not None:
             turns = xp.astype(state.time[..., None] < load.stop_time, state.time.dtype)
             thrust = turns if thrust is None else turns * thrust
-        known = each(load.believed_mass), moment(offset), moment(acceleration), each(drones + mass)
-        return PrivilegedInfo(*known, None if thrust is None else each(thrust, axes=1))
+        if load.thrust_fade is not None:
+            left = (1.0 - load.thrust_fade * state.time)[..., None]
+            thrust = left * xp.ones_like(state.rotor_force[..., 0]) if thrust is None else left * thrust
+        air = aerodynamics.effects(params, state, load)
+        if air.lift is not None:
+            lifts = air.lift.mean(axis=-1)
+            thrust = lifts if thrust is None else lifts * thrust
+        force = aerodynamics.drag_force(air, state)
+        if load.external_force is not None:
+            force = load.external_force if force is None else force + load.external_force
+        return PrivilegedInfo(
+            each(load.believed_mass),
+            moment(mass, offset),
+            moment(mass, acceleration),
+            each(drones + mass),
+            None if thrust is None else each(thrust, axes=1),
+            moment(mass, rate),
+            each(rotor_wrenches(plant, params, state.rotor_force, air)[..., :3], axes=2),
+            None if force is None else in_frames(force),
+            None if load.loop_scale is None else each(load.loop_scale),
+            None if state.loops is None else each(state.loops, axes=2),
+        )
 
     return privileged
 

@@ -25,8 +25,8 @@ OWN = 12  # numbers of a follower's own state: position, roll, pitch, yaw, veloc
 # (docs/archive/real-flights.md), in the slots of an observation; the last six are those of a sensor of the object.
 # White noise, standard deviation: position, roll and pitch and yaw, velocity, body rates.
 NOISE = np.array([*[5e-4] * 3, 1.5e-3, 1.5e-3, 5e-4, 5e-3, 5e-3, 1e-3, 0.01, 0.01, 4e-3, *[5e-4] * 3, *[5e-3] * 3])
-# Slow errors of the estimator: standard deviation, and time over which they are correlated [s]. Those of roll, pitch and
-# velocity grow with the speed, by 0.04 rad and 0.11 m/s per m/s, and are taken at 0.05 m/s.
+# Slow errors of the estimator: standard deviation, and time over which they are correlated [s]. Those of roll, pitch
+# and velocity grow with the speed, by 0.04 rad and 0.11 m/s per m/s, and are taken at 0.05 m/s.
 DRIFT = np.array([*[1e-3] * 3, 2e-3, 2e-3, 5e-3, 5.5e-3, 5.5e-3, 4e-3, *[0.0] * 3, *[1e-3] * 3, *[5.5e-3] * 3])
 DRIFT_TIME = np.array([*[0.4] * 3, 1.0, 1.0, 0.3, *[0.3] * 3, *[0.3] * 3, *[0.4] * 3, *[0.3] * 3])
 # Constant errors of a drone: position, of the object in the hand, and velocity at rest (ours). Those of its attitude

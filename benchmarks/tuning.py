@@ -1,0 +1,310 @@
+"""The tuning of the references of mjxball-bench: a search on flights that no table reports.
+
+`python benchmarks/tuning.py CONTROLLER [--track pair|team|rigs] [--condition both|calm|rough] [--sets N] [--rounds N]
+[--flights N] [--width W] [--log FILE]`
+
+CMA-ES (Hansen) over the logarithms of a controller's tuning; it starts from that which the controller has. All sets of
+a round fly all flights as one compiled program, on the CPU or on a GPU; `mpc` solves its programs on the CPU, set by
+set. What is made small is the mean over flights of the time after which |e_o| stays within a bound, over that of
+`oracle` and at most four, plus the share of flights without success: later than 1.25 times `oracle`, or a rotor at its
+limit for more than 5 % of the time. Of `oracle` itself it is the mean of that time in seconds. Bounds are 10 mm calm
+and 20 mm otherwise, times the rig's length over the pair's where it is longer. Every set is written to the log, one
+line of JSON each: its tuning, its cost, and the cost's parts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import dataclasses
+import functools
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import numpy as jnp
+
+from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_controller, oracle
+from mjxball.baselines.observer import Observer
+from mjxball.baselines.pid import Pid
+from mjxball.bench.tracks import worlds_of
+from mjxball.config import Config
+from mjxball.control.followers import Controller
+from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, near_limit, rotor_limits
+from mjxball.physics import newton_euler
+from mjxball.physics.step import jax_repeat, make_plant_step
+from mjxball.scalar_form import scalar_form
+from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays
+from mjxball.sim.scenario import Scenario
+from mjxball.xla import enable_compilation_cache
+
+DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
+BOUNDS = {"calm": 0.01, "rough": 0.02}  # [m]
+CRAZYFLIE_LENGTH = 2.0  # factor on the bounds of Crazyflies
+LATER, LIMITED = 1.25, 0.05  # of a success: time over that of `oracle`, share of time with a rotor at its limit
+ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
+WORST = 4.0  # times that of `oracle` a flight counts at most
+SEED, SETS, ROUNDS, WIDTH, FLIGHTS = 1007, 24, 40, 0.25, 24
+
+
+class Part(NamedTuple):
+    """Flights on one plant in one condition."""
+
+    config: Config
+    scenarios: Sequence[Scenario]
+    bound: float  # [m]
+    condition: str
+
+    @property
+    def undisturbed(self) -> Part:
+        """The same flights as `oracle` flies them."""
+        calm = [dataclasses.replace(one, disturbance=type(one.disturbance)()) for one in self.scenarios]
+        return self._replace(scenarios=calm)
+
+
+class Measured(NamedTuple):
+    """What S sets did in n flights, (S, n) each."""
+
+    time: np.ndarray  # after which |e_o| stays within the bound, infinite if it does not [s]
+    limited: np.ndarray  # share of time with any rotor at its limit
+    peak: np.ndarray  # largest |e_o| in the last third [m]
+
+
+def flights_of(track: str, condition: str, count: int) -> list[Part]:
+    """The flights of a search: `count` on each plant of a `track`; both conditions fly the same loads and goals."""
+    parts = []
+    for world in worlds_of(track, DRAW):
+        length = CRAZYFLIE_LENGTH if track == "crazyflie" else world.length
+        for number, name in enumerate(BOUNDS):
+            if condition in (name, "both"):
+                chosen = [dataclasses.replace(pair[number], seconds=SECONDS) for pair in world.scenarios[:count]]
+                parts.append(Part(world.config, chosen, BOUNDS[name] * length, name))
+    return parts
+
+
+class Tuned(NamedTuple):
+    """How a controller takes many tunings at once."""
+
+    start: Any  # the tuning that it has, a tuple of numbers by name
+    arrays: Callable[[Config, Any], Any]  # what a tuning becomes, a tree of arrays
+    make: Callable[[Config, Any], Controller]  # the controller of such a tree of traced arrays
+
+
+def _with(attribute: str, name: str) -> Callable[[Config, Any], Controller]:
+    """A controller called `name` whose `attribute` is replaced by traced arrays."""
+
+    def make(config: Config, arrays: Any) -> Controller:
+        controller = copy.copy(make_controller(name, config))
+        setattr(controller, attribute, arrays)
+        return controller
+
+    return make
+
+
+def _crazyflie_gains(config: Config, costs: Any) -> Any:
+    return crazyflie_oracle.CrazyflieOracle(config, costs).gains
+
+
+TUNED: dict[str, Tuned] = {
+    "crazyflie-lqg": Tuned(crazyflie_lqg.CrazyflieLqg.tuning, crazyflie_lqg.design, _with("design", "lqg")),
+    "crazyflie-oracle": Tuned(crazyflie_oracle.CrazyflieOracle.tuning, _crazyflie_gains, _with("gains", "oracle")),
+    "lqg": Tuned(lqg.Lqg.tuning, lqg.design, _with("design", "lqg")),
+    "oracle": Tuned(
+        oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning, (1.0,))[0], _with("gains", "oracle")
+    ),
+    "pid": Tuned(Pid.gains, lambda config, gains: gains, _with("gains", "pid")),
+    "observer": Tuned(Observer.gains, lambda config, gains: gains, _with("gains", "observer")),
+}
+
+
+class Flown:
+    """A compiled program that flies the flights of one part with any number of sets."""
+
+    def __init__(self, name: str, part: Part):
+        self._tuned, self._part = TUNED[name], part
+        flown = scenario_arrays(part.config, part.scenarios)
+        config = part.config
+        step = make_plant_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
+        loop = ClosedLoop(config, (scalar_form if config.autopilot.kind == "ideal" else jax.vmap)(step), flown.sensors)
+        privileged, most = make_privileged_info(config), rotor_limits(config.plant, part.scenarios)
+        total = len(flown.inputs.time)
+
+        def fly(arrays: Any, load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> Any:
+            controller = self._tuned.make(config, arrays)
+            state, observation = loop.start(start, inputs.goal[0], first, flown.delays)
+            zero = jnp.zeros_like(start.time)
+
+            def advance(carried: Any, now: Inputs) -> tuple[Any, None]:
+                carry, (last, limited, peak), number = carried
+                carry, row = control_step(loop, controller, privileged, load, carry, now, np.float32(0.0))
+                far = jnp.sqrt(((row.target - row.position) ** 2).sum(axis=-1))
+                inside = (far <= part.bound) & ~row.diverged
+                near = near_limit(AT_LIMIT_WITHIN, row.rotor_force, most[..., None]).max(axis=(-2, -1))
+                last = jnp.where(inside, last, number + 1.0)
+                late = jnp.where(number >= 2 * total // 3, jnp.where(row.diverged, jnp.inf, far), 0.0)
+                return (carry, (last, limited + near / total, jnp.maximum(peak, late)), number + 1.0), None
+
+            carried = Carry(state, observation, controller.start(observation)), (zero, zero, zero), jnp.float32(0.0)
+            return jax.lax.scan(advance, carried, inputs)[0][1]
+
+        given = (flown.load, flown.start, flown.inputs, flown.first, most)
+        self._given = jax.tree.map(
+            lambda leaf: np.asarray(leaf, np.float32 if leaf.dtype == np.float64 else None), given
+        )
+        self._fly = jax.jit(jax.vmap(fly, in_axes=(0, *[None] * len(given))))
+        self._total, self._period = total, config.timing.control_period
+
+    def __call__(self, arrays: Any) -> Measured:
+        """`arrays` with a leading axis of sets."""
+        last, limited, peak = (np.asarray(part, float) for part in self._fly(arrays, *self._given))
+        seconds = np.where(last >= self._total, np.inf, last * self._period)
+        return Measured(np.maximum(seconds, self._period), limited, peak)
+
+
+def designs(name: str, config: Config, sets: Sequence[Any], pool: ProcessPoolExecutor | None) -> Any:
+    """The arrays of all `sets`, stacked, in float32."""
+    function = functools.partial(_design, name, config)
+    found = list(pool.map(function, sets) if pool else map(function, sets))
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *found)
+
+
+def _design(name: str, config: Config, tuning: Any) -> Any:
+    return TUNED[name].arrays(config, tuning)
+
+
+class Search:
+    """The cost of sets of one controller on all parts, and its log."""
+
+    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: ProcessPoolExecutor | None = None):
+        self.tuned, self._name, self._parts, self._log, self._pool = TUNED[name], name, parts, log, pool
+        self._flown = [Flown(name, part.undisturbed if name in ORACLES else part) for part in parts]
+        self._known = [None if name in ORACLES else known(part) for part in parts]
+        self._begun = time.perf_counter()
+
+    def __call__(self, sets: np.ndarray) -> np.ndarray:
+        """(S,) costs of `sets` (S, k), values of what is `searched`."""
+        tunings = [tuned(self.tuned.start, values) for values in sets]
+        found = [
+            parts_of_cost(flown(designs(self._name, part.config, tunings, self._pool)), known)
+            for flown, part, known in zip(self._flown, self._parts, self._known, strict=True)
+        ]
+        costs = np.mean([parts["cost"] for parts in found], axis=0)
+        for number, tuning in enumerate(tunings):
+            parts = [
+                {"condition": part.condition, **{key: round(float(values[number]), 4) for key, values in own.items()}}
+                for part, own in zip(self._parts, found, strict=True)
+            ]
+            self._write({"cost": round(float(costs[number]), 4), "tuning": tuning._asdict(), "parts": parts})
+        return costs
+
+    def _write(self, record: dict[str, Any]) -> None:
+        if self._log:
+            seconds = round(time.perf_counter() - self._begun, 1)
+            with self._log.open("a") as file:
+                file.write(json.dumps({"controller": self._name, "seconds": seconds, **record}) + "\n")
+
+
+def known(part: Part) -> Measured:
+    """The flights of `oracle`."""
+    name = ORACLES[part.config.autopilot.kind == "crazyflie"]
+    return Flown(name, part.undisturbed)(designs(name, part.config, [TUNED[name].start], None))
+
+
+def parts_of_cost(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
+    """(S,) each: the cost, the mean time [s] or ratio, the share of successes, of time at limits, the 90 % peak [m]."""
+    late = np.minimum(measured.time, SECONDS)
+    limited = measured.limited > LIMITED
+    if known is None:
+        succeeds, ratio = np.isfinite(measured.time) & ~limited, late
+    else:
+        succeeds = (measured.time <= LATER * known.time) & ~limited
+        ratio = np.minimum(late / np.minimum(known.time, SECONDS), WORST)
+    return {
+        "cost": ratio.mean(axis=1) + (1.0 - succeeds.mean(axis=1)),
+        "time": ratio.mean(axis=1),
+        "median": np.median(late, axis=1),
+        "succeeded": succeeds.mean(axis=1),
+        "limited": measured.limited.mean(axis=1),
+        "peak_90": np.quantile(measured.peak, 0.9, axis=1),
+    }
+
+
+def searched(tuning: Any) -> list[str]:
+    """Names of those parameters that have a logarithm: what is 0 or infinite is switched off, and stays so."""
+    return [name for name, value in tuning._asdict().items() if 0.0 < value < math.inf]
+
+
+def tuned(given: Any, values: np.ndarray) -> Any:
+    """`given` with `values` (k,) of what is `searched`."""
+    return given._replace(**dict(zip(searched(given), map(float, values), strict=True)))
+
+
+def minimise(
+    cost: Callable[[np.ndarray], np.ndarray], start: np.ndarray, width: float, sets: int, rounds: int
+) -> tuple[np.ndarray, float]:
+    """(point (k,), its cost) where `cost` of points (S, k) is least, found by CMA-ES about `start` (k,)."""
+    k, random = len(start), np.random.default_rng(SEED)
+    weights = np.log(sets / 2 + 0.5) - np.log(np.arange(1, sets // 2 + 1))
+    weights /= weights.sum()
+    mu = 1 / (weights**2).sum()
+    c_path, c_width = (4 + mu / k) / (k + 4 + 2 * mu / k), (mu + 2) / (k + mu + 5)
+    c_one = 2 / ((k + 1.3) ** 2 + mu)
+    c_mu = min(1 - c_one, 2 * (mu - 2 + 1 / mu) / ((k + 2) ** 2 + mu))
+    damping = 1 + 2 * max(0.0, math.sqrt((mu - 1) / (k + 1)) - 1) + c_width
+    length = math.sqrt(k) * (1 - 1 / (4 * k) + 1 / (21 * k * k))
+    mean, covariance, path, width_path = start.copy(), np.eye(k), np.zeros(k), np.zeros(k)
+    best, least = start, math.inf
+    for number in range(rounds):
+        values, axes = np.linalg.eigh(covariance)
+        root = axes * np.sqrt(np.maximum(values, 1e-20))
+        steps = random.standard_normal((sets, k)) @ root.T
+        found = cost(mean + width * steps)
+        order = np.argsort(found)
+        if found[order[0]] < least:
+            best, least = mean + width * steps[order[0]], float(found[order[0]])
+        step = weights @ steps[order[: len(weights)]]
+        mean = mean + width * step
+        white = axes @ ((axes.T @ step) / np.sqrt(np.maximum(values, 1e-20)))
+        width_path = (1 - c_width) * width_path + math.sqrt(c_width * (2 - c_width) * mu) * white
+        path = (1 - c_path) * path + math.sqrt(c_path * (2 - c_path) * mu) * step
+        chosen = steps[order[: len(weights)]]
+        covariance = (1 - c_one - c_mu) * covariance + c_one * np.outer(path, path)
+        covariance += c_mu * (chosen.T * weights) @ chosen
+        width *= math.exp(c_width / damping * (np.linalg.norm(width_path) / length - 1))
+        print(f"round {number + 1}: {least:.3f} median {np.median(found):.3f} width {width:.3f}", flush=True)
+    return best, least
+
+
+def main() -> None:
+    """Search, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("controller", choices=TUNED)
+    parser.add_argument("--track", default="pair", help="whose plants and loads fly")
+    parser.add_argument("--condition", choices=(*BOUNDS, "both"), default="both")
+    parser.add_argument("--flights", type=int, default=FLIGHTS, help="of each plant")
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--sets", type=int, default=SETS, help="in each round")
+    parser.add_argument("--width", type=float, default=WIDTH, help="of the first steps, in the logarithm")
+    parser.add_argument("--cores", type=int, default=1, help="processes that solve the Riccati equations")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="JSON lines, added to")
+    options = parser.parse_args()
+    enable_compilation_cache()
+    with ProcessPoolExecutor(options.cores) if options.cores > 1 else contextlib.nullcontext() as pool:
+        parts = flights_of(options.track, options.condition, options.flights)
+        search = Search(options.controller, parts, options.log, pool)
+        start = np.log([getattr(search.tuned.start, name) for name in searched(search.tuned.start)])
+        best, least = minimise(lambda sets: search(np.exp(sets)), start, options.width, options.sets, options.rounds)
+    found = tuned(search.tuned.start, np.exp(best))
+    print(f"{least:.4f}", {name: float(f"{value:.4g}") for name, value in found._asdict().items()})
+
+
+if __name__ == "__main__":
+    main()
