@@ -77,7 +77,7 @@ def _flight(env: TransportEnv, key: Any, rig: RigTable, controller: Controller, 
     if isinstance(controller, AnyRigController):
         controller = controller.on(rig, config.plant)
 
-    def privileged(plant: PlantState, load: Any) -> PrivilegedInfo:
+    def privileged(plant: PlantState, load: Any, _: Any) -> PrivilegedInfo:
         return _privileged(plant, load, world.parameters, config.plant.count)
 
     def step(carried: tuple[Carry, Any, RunningMetrics], time: Any) -> Any:

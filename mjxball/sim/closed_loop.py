@@ -55,7 +55,7 @@ class ClosedLoop(Controllers):
     ):
         super().__init__(config, parameters)
         self._plant_step, self._sensors, self._jitters = plant_step, sensors, jitters
-        self._period, self._count = config.timing.control_period, config.plant.count
+        self.period, self._count = config.timing.control_period, config.plant.count
         self._leader_measures = config.scenario.leader_uses_measurements
 
     def start(
@@ -109,7 +109,7 @@ class ClosedLoop(Controllers):
         if not (isinstance(diverged, np.ndarray | np.generic) and not diverged.any()):
             plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
         on_pid = np.asarray(on_pid)[..., None]
-        integral = self.integrate(state.integral, leader_sees, goal, self._period, on_pid, commands.follower)
+        integral = self.integrate(state.integral, leader_sees, goal, self.period, on_pid, commands.follower)
         sensors, truth = state.sensors, self._truth(plant, goals[1], load)
         if self._sensors.present:
             sensors, measured = self._sensors.step(sensors, self._measurable(truth), sample)

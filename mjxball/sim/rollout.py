@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from mjxball.arrays import Array
-    from mjxball.physics.engine import Coordinates
+    from mjxball.physics.engine import Coordinates, Vector
 
 ENDS = slice(-1), slice(1, None)  # rows of the beginnings of control steps, and of their ends
 NO_FLOOR = 1e6  # [m] below the origin: of a flight without ground in a batch with
@@ -75,7 +75,7 @@ class Inputs(NamedTuple):
 def control_step(
     loop: ClosedLoop,
     controller: Controller,
-    privileged: Callable[[PlantState, Load], Any],
+    privileged: Callable[..., Any],
     load: Load,
     carry: Carry,
     inputs: Inputs,
@@ -89,10 +89,16 @@ def control_step(
     state, seen, plant = carry.loop, carry.observation, carry.loop.plant
     acting = load._replace(external_force=inputs.force, late=inputs.late)
     goals = inputs.goal, inputs.next_goal
-    memory, answer = controller.step(carry.follower, seen, privileged(plant, acting))
+    known = privileged(plant, acting, _goal_acceleration(goals, loop.period))
+    memory, answer = controller.step(carry.follower, seen, known)
     moved, observation, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, on_pid)
     row = Trajectory.of(plant, inputs.time, inputs.goal.position, commands, diverged=state.diverged, observation=seen)
     return Carry(moved, observation, memory), row
+
+
+def _goal_acceleration(goals: tuple[Goal, Goal], period: float) -> Vector | None:
+    now, after = goals
+    return None if now.rate is None or after.rate is None else (after.rate - now.rate) / period
 
 
 class ScenarioArrays(NamedTuple):
@@ -211,10 +217,11 @@ class _Together:
         return state, np.concatenate(commands)
 
 
-def make_privileged_info(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
-    """Return `privileged(state, load)`: the present truth for a classical follower.
+def make_privileged_info(config: Config) -> Callable[..., PrivilegedInfo]:
+    """Return `privileged(state, load, goal_acceleration=None)`: the present truth for a classical follower.
 
-    Of a freely rolling ball the acceleration is taken for 0.
+    A goal that is accelerated [m/s2] acts as a force against it. The acceleration of a freely rolling ball is taken
+    for 0.
     """
     plant, params = config.plant, plant_parameters(config.plant, config.attitude)
     angles, several = mount_angles(plant), len(plant.followers) > 1
@@ -241,7 +248,7 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
         parts = [mass * along[plant.directions.index(k)] if k in plant.directions else 0.0 * mass for k in (0, 1)]
         return in_frames(joined([*parts, 0.0 * mass]))[..., :2]
 
-    def privileged(state: PlantState, load: Load) -> PrivilegedInfo:
+    def privileged(state: PlantState, load: Load, goal_acceleration: Vector | None = None) -> PrivilegedInfo:
         xp, mass = state.time.__array_namespace__(), object_mass(state.time, load)
         if prescribed is None:
             share, ball = plant.moving_fraction, state.ball_offset
@@ -262,6 +269,9 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
         force = aerodynamics.drag_force(air, state)
         if load.external_force is not None:
             force = load.external_force if force is None else force + load.external_force
+        if goal_acceleration is not None:
+            inertial = -(drones + mass)[..., None] * goal_acceleration
+            force = inertial if force is None else force + inertial
         return PrivilegedInfo(
             each(load.believed_mass),
             moment(mass, offset),
