@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Controller, Follower
+from mjxball.control.followers import Baseline, Controller, Follower, residual_on_pid
 from mjxball.errors import InputError
 from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
@@ -45,7 +45,7 @@ def fly_compiled(
     rewritten = physics == "newton-euler" and config.autopilot.kind == "ideal"
     step = (scalar_form if rewritten else jax.vmap)(make_plant_step(config, engine, jax_repeat))
     loop, privileged = ClosedLoop(config, step, flown.sensors), make_privileged_info(config)
-    on_pid = np.float32(not isinstance(follower, Baseline))
+    on_pid = np.float32(residual_on_pid(follower))
     leader, limit = config.plant.leader, config.scenario.termination_distance
 
     def fly(load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> metrics.RunningMetrics:

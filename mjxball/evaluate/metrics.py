@@ -50,6 +50,10 @@ class Metrics:
     rotor_power: float | None  # mean of sum F^1.5 over all rotors, over that at the start, hover
     command_spread: float | None  # rms of the followers' roll and pitch about their mean; None: one follower [rad]
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
+    rotor_limit_share: float | None = None  # as rotors_at_limit, of the one rotor that is longest at a limit
+    reached: float | None = None  # first time |e_o| is within `radius`, None: never [s]
+    arrival: float | None = None  # last time |e_o| exceeds `radius`, None: it does in the end [s]
+    late_error: float | None = None  # largest |e_o| after `deadline` [m]
 
     @property
     def peak(self) -> float:
@@ -85,10 +89,27 @@ class RunningMetrics(NamedTuple):
     hover_power: Array  # of all rotors there [N^1.5]
     tilts: Array  # (n, F, 2) their last roll and pitch commands
     target: Array  # (n, 3)
+    limited: Array  # (n, N, 4) steps in which a rotor is at a limit
+    radius: Array  # about the goal, NaN: none [m]
+    deadline: Array  # after which `late_error` counts, NaN: none [s]
+    reached: Array  # [s], inf: never
+    beyond: Array  # last time |e_o| was beyond `radius`, -inf: never [s]
+    late_error: Array  # [m], NaN before the first
 
 
-def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -> RunningMetrics:
-    """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, N, 4)."""
+def begin(
+    position: Array,
+    target: Array,
+    rotor_force: Array,
+    leader: int = 0,
+    radius: Array | float = math.nan,
+    deadline: Array | float = math.nan,
+) -> RunningMetrics:
+    """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, N, 4).
+
+    `radius` [m] about the goal and `deadline` [s], one number or (n,), are those of `Metrics.arrival` and `late_error`.
+    A goal that changes does not begin either anew.
+    """
     xp = position.__array_namespace__()
     hover = _of_followers(rotor_force, leader)
     zero, none = xp.zeros_like(position[:, 0]), xp.full_like(position, xp.nan)
@@ -110,6 +131,12 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
         hover_power=power_of(rotor_force),
         tilts=xp.zeros_like(hover[..., :2]),
         target=target,
+        limited=xp.zeros_like(rotor_force),
+        radius=zero + radius,
+        deadline=zero + deadline,
+        reached=zero + xp.inf,
+        beyond=zero - xp.inf,
+        late_error=zero + xp.nan,
     )
 
 
@@ -137,7 +164,11 @@ def update(
     peaks = xp.where(new[:, None], xp.nan, running.peaks)
     steady = row.time >= steady_from - TINY
     errors = xp.concat([xp.abs(error), xp.hypot(error[:, :1], error[:, 1:2])], axis=-1)
-    sums, excess = compensated_sum(running.sums, running.excess, _taken(running, row, rotor_force_max, leader))
+    most = xp.asarray(rotor_force_max, dtype=row.rotor_force.dtype)
+    most = xp.broadcast_to(most, row.rotor_force.shape[:-1])[..., None]
+    limited = near_limit(AT_LIMIT_WITHIN, row.rotor_force, most)
+    sums, excess = compensated_sum(running.sums, running.excess, _taken(running, row, most, limited, leader))
+    near, time = distance <= running.radius, running.leg * 0 + row.time
     return RunningMetrics(
         steps=running.steps + 1,
         time=running.time * 0 + row.time,
@@ -157,17 +188,24 @@ def update(
         hover_power=running.hover_power,
         tilts=xp.reshape(row.follower_command, (*running.hover.shape[:2], 3))[..., :2],
         target=row.target,
+        limited=running.limited + limited,
+        radius=running.radius,
+        deadline=running.deadline,
+        reached=xp.where(near, xp.minimum(running.reached, time), running.reached),
+        beyond=xp.where(near, running.beyond, time),
+        late_error=xp.where(time > running.deadline, xp.fmax(running.late_error, distance), running.late_error),
     )
 
 
-def _taken(running: RunningMetrics, row: Trajectory, rotor_force_max: Array | float, leader: int) -> Array:
-    """Contribution of one control step to `RunningMetrics.sums` (n, 9)."""
+def _taken(running: RunningMetrics, row: Trajectory, most: Array, limited: Array, leader: int) -> Array:
+    """Contribution of one control step to `RunningMetrics.sums` (n, 9).
+
+    `most` (n, N, 1) is the largest force of each drone's rotors [N], `limited` (n, N, 4) 1 where a rotor is at a limit.
+    """
     xp = row.position.__array_namespace__()
     rotors = _of_followers(row.rotor_force, leader)
     led, followed = row.leader_command[:, None], xp.reshape(row.follower_command, (*rotors.shape[:2], 3))
     tilts = followed[..., :2]
-    most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
-    most = xp.broadcast_to(most, row.rotor_force.shape[:-1])[..., None]
     saturated = _of_followers(near_limit(SATURATED_WITHIN, row.rotor_force, most), leader)
     change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
     apart = tilts - xp.mean(tilts, axis=-2, keepdims=True)
@@ -178,7 +216,7 @@ def _taken(running: RunningMetrics, row: Trajectory, rotor_force_max: Array | fl
         xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
         xp.where(running.steps > 0, change, 0.0),
         xp.mean(saturated, axis=(-2, -1)),
-        xp.max(near_limit(AT_LIMIT_WITHIN, row.rotor_force, most), axis=(-2, -1)),
+        xp.max(limited, axis=(-2, -1)),
         power_of(row.rotor_force),
         xp.mean(apart**2, axis=(-2, -1)),
     )
@@ -200,8 +238,10 @@ def results(running: RunningMetrics) -> list[Metrics]:
         peaks = np.where((t.steady > 1)[:, None], t.peaks, np.nan)
         goal = np.where(t.target == 0, np.nan, t.target)
         over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / np.abs(goal))
+        last = t.time - NEVER_WITHIN - ROUNDING
         settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
-        settled = np.where(t.outside >= (t.time - NEVER_WITHIN - ROUNDING)[..., None], np.nan, settled)
+        settled = np.where(t.outside >= last[..., None], np.nan, settled)
+        arrival = np.where(np.isnan(t.radius) | (t.beyond >= last), np.nan, np.fmax(t.beyond, 0.0))
         columns = {
             "rmse": np.sqrt(square / t.early),
             "settling_time": settled[:, 0],
@@ -218,8 +258,12 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "smoothness": np.sqrt(change / np.maximum(t.steps - 1, 1)),
             "saturation": saturated / t.steps,
             "rotors_at_limit": limited / t.steps,
+            "rotor_limit_share": t.limited.max(axis=(-2, -1)) / t.steps,
             "rotor_power": power / t.steps / t.hover_power,
             "command_spread": np.sqrt(spread / t.steps) if t.hover.shape[1] > 1 else spread * np.nan,
+            "reached": t.reached,
+            "arrival": arrival,
+            "late_error": t.late_error,
         }
     rows = zip(*columns.values(), strict=True)
     named = (dict(zip(columns, map(_number, row), strict=True)) for row in rows)
@@ -237,26 +281,42 @@ def rotor_limits(plant: Plant, scenarios: Sequence[Scenario]) -> np.ndarray:
     return found
 
 
-def fly_and_measure(config: Config, flights: Flights, physics: str = "mjx") -> tuple[Trajectory, list[Metrics]]:
-    """Every flight of `simulate_batch`, with its metrics."""
+def fly_and_measure(
+    config: Config,
+    flights: Flights,
+    physics: str = "mjx",
+    radius: Array | float = math.nan,
+    deadline: Array | float = math.nan,
+) -> tuple[Trajectory, list[Metrics]]:
+    """Every flight of `simulate_batch`, with its metrics; `radius` and `deadline` as in `begin`."""
     flown, scenarios = simulate_batch(config, flights, physics), [one for _, part in flights for one in part]
     limit, most = config.scenario.termination_distance, rotor_limits(config.plant, scenarios)
-    return flown, measure_batch(flown, limit, most, config.plant.leader)
+    return flown, measure_batch(flown, limit, most, config.plant.leader, radius, deadline)
 
 
 def measure(
-    flight: Trajectory, termination_distance: float = 2.5, rotor_force_max: Array | float = 5.5, leader: int = 0
+    flight: Trajectory,
+    termination_distance: float = 2.5,
+    rotor_force_max: Array | float = 5.5,
+    leader: int = 0,
+    radius: float = math.nan,
+    deadline: float = math.nan,
 ) -> Metrics:
     """Metrics of one recorded flight (no batch axis)."""
-    return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader)[0]
+    return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader, radius, deadline)[0]
 
 
 def measure_batch(
-    flights: Trajectory, termination_distance: float, rotor_force_max: Array | float = 5.5, leader: int = 0
+    flights: Trajectory,
+    termination_distance: float,
+    rotor_force_max: Array | float = 5.5,
+    leader: int = 0,
+    radius: Array | float = math.nan,
+    deadline: Array | float = math.nan,
 ) -> list[Metrics]:
-    """Metrics of every flight of a recorded batch."""
+    """Metrics of every flight of a recorded batch; `radius` and `deadline` as in `begin`."""
     first = flights.row(0)
-    running = begin(first.position, first.target, first.rotor_force, leader)
+    running = begin(first.position, first.target, first.rotor_force, leader, radius, deadline)
     for number in range(len(flights.time)):
         running = update(running, flights.row(number), termination_distance, rotor_force_max, leader)
     return results(running)
