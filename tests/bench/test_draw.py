@@ -147,10 +147,8 @@ def test_storing_a_track_writes_what_is_read(tmp_path: Path, monkeypatch: pytest
     assert store.main(["pair"]) == 0
     try:
         draw.read_stored.cache_clear()
-        assert groups_of.__wrapped__("pair", 0) == (draw._found("pair", 0, 0, TRACKS["pair"].flights(0)[0]),)
-        with pytest.raises(
-            InputError, match="flights of track team are not stored; python -m mjxball.bench.store team"
-        ):
+        assert draw.definition(groups_of.__wrapped__("pair", 0)) == draw.stored_form("pair")["definition"]
+        with pytest.raises(InputError, match="flights of track team are not stored"):
             draw.read_stored("team")
     finally:
         draw.read_stored.cache_clear()

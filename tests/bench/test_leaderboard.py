@@ -53,7 +53,7 @@ def test_an_entry_that_is_refused_and_two_of_one_follower_end_it(
 ) -> None:
     (tmp_path / "one.json").write_text(json.dumps(known()))
     for change, said in (
-        ({"version": 1}, "two.json is of version 1 of mjxball-bench"),
+        ({"version": 1}, "two.json is of version 1 of mjxball"),
         ({}, "two entries are of mine"),
     ):
         (tmp_path / "two.json").write_text(json.dumps(known(**change)))
