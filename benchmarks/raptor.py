@@ -38,7 +38,8 @@ from mjxball.bench.tracks import TRACKS
 from mjxball.config import Config
 from mjxball.control import observation, rotations
 from mjxball.errors import InputError
-from mjxball.evaluate import metrics
+from mjxball.evaluate.metrics import results, rotor_limits
+from mjxball.evaluate.running_metrics import begin, update
 from mjxball.files import write_atomically
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
@@ -108,13 +109,13 @@ def fly_group(group: Group, track: str, key: str, raptor: Any) -> list[Result]:
     follower, nothing = plant.followers[0], np.zeros((len(goal), 3))
     sensed, measured = flown.sensors.start(truth(state, follower), flown.first, flown.delays)
     radii, deadlines = (np.array([getattr(one, name) for one in group.flights]) for name in ("radius", "deadline"))
-    running = metrics.begin(state.position, goal, state.rotor_force, plant.leader, radii, deadlines)
-    limits = metrics.rotor_limits(plant, scenarios)
+    running = begin(state.position, goal, state.rotor_force, plant.leader, radii, deadlines)
+    limits = rotor_limits(plant, scenarios)
     command = 2 * np.clip(state.rotor_force / most, 0.0, 1.0) - 1
     for number, time in enumerate(inputs.time):
         if number % 2 == 0:  # the 50 Hz of every other follower's flights
             row = Trajectory.of(state, time, goal, TeamCommands(nothing, nothing), diverged=has_diverged(state))
-            running = metrics.update(running, row, config.scenario.termination_distance, limits, plant.leader)
+            running = update(running, row, config.scenario.termination_distance, limits, plant.leader)
         seen = [truth(state, plant.leader), measured] if plant.leader < follower else [measured, truth(state, 1)]
         given = np.stack([see(own, mount, goal) for own, mount in zip(seen, mounts, strict=True)], axis=1)
         given = np.concatenate([given, command], axis=-1)
@@ -124,7 +125,7 @@ def fly_group(group: Group, track: str, key: str, raptor: Any) -> list[Result]:
         sensed, measured = flown.sensors.step(sensed, truth(state, follower), inputs.sample.at(number))
     return [
         Result(0, flight, one, reasons(one, flight.deadline))
-        for flight, one in zip(group.flights, metrics.results(running), strict=True)
+        for flight, one in zip(group.flights, results(running), strict=True)
     ]
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mjxball.config import preset
-from mjxball.evaluate.metrics import Metrics, begin, measure, measure_batch, results, rotor_limits, update
+from mjxball.evaluate.metrics import Metrics, measure, measure_batch, results, rotor_limits
+from mjxball.evaluate.running_metrics import begin, update
 from mjxball.sim.scenario import Scenario
 from mjxball.sim.trajectory import Trajectory
 
