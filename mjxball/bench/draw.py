@@ -1,6 +1,6 @@
 """The flights of a draw: candidates of the tracks that the oracle succeeds in, with its arrivals.
 
-Those of draw 0 are stored in `draws/TRACK.json` (`python -m mjxball.bench.store` writes them), those of another draw
+Those of draw 0 are stored in one file a track (`python -m mjxball.bench.store` writes them), those of another draw
 are found when they are asked for, by the same function.
 """
 
