@@ -41,6 +41,7 @@ class Air:
 
 
 OUTDOORS = Air()
+RIGS_AIR = dataclasses.replace(OUTDOORS, loops=(0.0, 0.0))  # random rigs have loops of 4 to 20 rad/s
 CRAZYFLIE = Air((0.25, 0.45), (0.0, 0.3), (0.0, 0.002), (0.0, 0.2), (0.02, 1.0), (0.0, 0.0), True)
 
 

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from mjxball.bench import CONDITIONS, VERSION
+from mjxball.bench.conditions import CRAZYFLIE, OUTDOORS, RIGS_AIR, Air, in_calm, in_world
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.constants import trim_limit
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude, largest_margin
-from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.goals import GoalMotion
 from mjxball.sim.rigs import RigTable, rig_config, sample_rigs, unpadded
 from mjxball.sim.scenario import CgPath, Scenario
 
@@ -36,9 +37,8 @@ LOADS = (0.5, 1.5)  # mass of a team's object over that of its plant
 DIRECTIONS = tuple((math.cos(angle), math.sin(angle)) for angle in np.pi * np.arange(8) / 8)
 RATIOS = (1.0, 1.5, 2.0)  # of both speeds of a path
 RIGS, EACH_RIG = (2, 3, 4, 5, 6), 3  # drones of a rig, flights of each rig
-NOISE, DELAY, RIG_DELAY = 1.0, 0.04, 0.02  # level, [s], [s] of random rigs
-THRUST = (0.985, 1.015)  # factor on the Crazyflies' rotor forces
-CRAZYFLIE = Disturbance(noise=0.5, estimator_drift=1.0, delay=0.03, quantize=True)
+GOAL_SPEED, CIRCLES = (0.1, 0.5), (0.3, 1.0)  # of goals that move [m/s], radii of their circles [m]
+RAMP = (3.0, 15.0)  # ends of ramps [s], in one flight of two
 # A flight sampled with a generator for a condition; None: it cannot be trimmed.
 Sampler = Callable[[np.random.Generator, str], Scenario | None]
 
@@ -83,8 +83,10 @@ def _goal(random: np.random.Generator, distance: float = 1.0) -> tuple[float, fl
     return x, y, z
 
 
-def _disturbance(condition: str, delay: float = DELAY) -> Disturbance:
-    return Disturbance(noise=NOISE, delay=delay) if condition == "world" else Disturbance()
+def _as_in(
+    condition: str, scenario: Scenario, config: Config, random: np.random.Generator, air: Air = OUTDOORS
+) -> Scenario:
+    return in_world(scenario, config, random, air) if condition == "world" else in_calm(scenario)
 
 
 def _pair(draw: int, known: bool) -> list[PlantFlights]:
@@ -95,7 +97,7 @@ def _pair(draw: int, known: bool) -> list[PlantFlights]:
         believed = mass if known else BELIEVED
         if amplitude > trim_limit(config.plant, mass, MARGIN, believed):
             return None
-        return Scenario(
+        scenario = Scenario(
             omega=float(random.uniform(*SPEEDS)),
             amplitude=amplitude,
             mass=mass,
@@ -103,10 +105,32 @@ def _pair(draw: int, known: bool) -> list[PlantFlights]:
             phase=float(random.uniform(0, 2 * math.pi)),
             goal=_goal(random),
             seconds=SECONDS,
-            disturbance=_disturbance(condition),
         )
+        return _as_in(condition, scenario, config, random)
 
     return [PlantFlights(config, sample)]
+
+
+def _moving(draw: int) -> list[PlantFlights]:
+    (pair,) = _pair(draw, True)
+
+    def sample(random: np.random.Generator, condition: str) -> Scenario | None:
+        scenario = pair.sample(random, condition)
+        return scenario and replace(scenario, goal=(0.0, 0.0, 0.0), goal_motion=_goal_motion(random))
+
+    return [PlantFlights(pair.config, sample, moving=True)]
+
+
+def _goal_motion(random: np.random.Generator) -> GoalMotion:
+    """A ramp in any direction, which ends in one flight of two, or a horizontal circle either way."""
+    speed = float(random.uniform(*GOAL_SPEED))
+    if random.uniform() < 0.5:
+        way = random.standard_normal(3)
+        x, y, z = map(float, speed * way / np.linalg.norm(way))
+        until = float(random.uniform(*RAMP)) if random.uniform() < 0.5 else math.inf
+        return GoalMotion((x, y, z), until)
+    radius, phase = float(random.uniform(*CIRCLES)), float(random.uniform(0, 2 * math.pi))
+    return GoalMotion(radius=radius, speed=float(random.choice([-1.0, 1.0])) * speed / radius, phase=phase)
 
 
 def _team(draw: int) -> list[PlantFlights]:
@@ -127,7 +151,7 @@ def _sample_team(config: Config, random: np.random.Generator, condition: str) ->
         ratio=float(random.choice(RATIOS)),
         lead=float(random.uniform(0, 2 * math.pi)),
     )
-    return Scenario(
+    scenario = Scenario(
         omega=float(random.uniform(*SPEEDS)),
         amplitude=float(random.uniform(0, 1)) * min(most, cg_limit(config.plant)) / math.hypot(1, width),
         mass=mass,
@@ -135,8 +159,8 @@ def _sample_team(config: Config, random: np.random.Generator, condition: str) ->
         path=path,
         goal=_goal(random),
         seconds=SECONDS,
-        disturbance=_disturbance(condition),
     )
+    return _as_in(condition, scenario, config, random)
 
 
 def _rigs(draw: int) -> list[PlantFlights]:
@@ -147,13 +171,13 @@ def _rigs(draw: int) -> list[PlantFlights]:
         for row in range(each):
             radius = RADIUS * max(1.0, float(rigs.length[row]) / RIG_LENGTH)
             config = rig_config(base, rigs, row)
-            found.append(PlantFlights(config, partial(_sample_rig, rigs, row), EACH_RIG, radius))
+            found.append(PlantFlights(config, partial(_sample_rig, config, rigs, row), EACH_RIG, radius))
     return found
 
 
-def _sample_rig(rigs: RigTable, row: int, random: np.random.Generator, condition: str) -> Scenario:
+def _sample_rig(config: Config, rigs: RigTable, row: int, random: np.random.Generator, condition: str) -> Scenario:
     path = CgPath(float(random.uniform(0, 2 * math.pi)), float(random.uniform(0, 1)), 1.0, math.pi / 2)
-    return Scenario(
+    scenario = Scenario(
         omega=float(random.uniform(*SPEEDS)),
         amplitude=float(random.uniform(0, rigs.reach[row])),
         mass=float(rigs.object_mass[row]),
@@ -163,8 +187,8 @@ def _sample_rig(rigs: RigTable, row: int, random: np.random.Generator, condition
         path=path,
         goal=_goal(random),
         seconds=SECONDS,
-        disturbance=_disturbance(condition, RIG_DELAY),
     )
+    return _as_in(condition, scenario, config, random, RIGS_AIR)
 
 
 def _crazyflie(draw: int) -> list[PlantFlights]:
@@ -181,10 +205,9 @@ def _sample_crazyflie(config: Config, random: np.random.Generator, condition: st
         believed_mass=config.plant.object_mass,
         phase=float(random.uniform(0, 2 * math.pi)),
         goal=_goal(random, ranges.goal_range),
-        thrust=tuple(map(float, random.uniform(*THRUST, 2))),
         seconds=SECONDS,
-        disturbance=CRAZYFLIE if condition == "world" else Disturbance(),
     )
+    scenario = _as_in(condition, scenario, config, random, CRAZYFLIE)
     known = scenario.believed_mass, (), False, scenario.thrust
     trims = [largest_margin(config, scenario.mass, side * scenario.amplitude, *known) for side in (-1, 1)]
     return scenario if min(trim.margin for trim in trims) >= MARGIN else None
@@ -198,5 +221,6 @@ TRACKS: dict[str, Track] = {
         Track("team", "teams of 3 to 6", _team),
         Track("rigs", "any rig", _rigs),
         Track("crazyflie", "two Crazyflies", _crazyflie),
+        Track("moving", "pair, goals that move", _moving),
     )
 }
