@@ -30,6 +30,16 @@ class PrivilegedInfo(NamedTuple):
     total_mass: Array  # (...) of the assembly [kg]
     thrust: Array | None = None  # (..., N) present factor on each drone's rotor forces; None: 1
 
+    @classmethod
+    def of_believed(cls, believed_mass: Array) -> PrivilegedInfo:
+        """What any follower may read: `believed_mass` (...), and zeros instead of the rest."""
+        zero = 0.0 * believed_mass
+        return cls(believed_mass, zero, zero, zero)
+
+    def without_truth(self) -> PrivilegedInfo:
+        """The same for a follower without `needs_privileged`, so that one which wrongly says so learns nothing."""
+        return self.of_believed(self.believed_mass)
+
 
 class Controller(Protocol):
     """A follower's controller as two pure functions of arrays; `state` is a tuple of arrays (possibly empty)."""
@@ -51,6 +61,7 @@ class Follower(Protocol):
     """
 
     name: str
+    # A follower may also have `residual_on_pid`, see `residual_on_pid`.
 
     def reset(self) -> None:
         """Start an episode with a fresh state."""
@@ -60,6 +71,15 @@ class Follower(Protocol):
 
         Raises InputError for an invalid observation (`checked_observation`) and leaves the state as it was.
         """
+
+
+def residual_on_pid(follower: Any) -> bool:
+    """Whether the integrals of both drones' PID controller are added to the command of `follower`.
+
+    A follower or controller says so by an attribute of this name, as a policy trained with `follower.residual_on_pid`
+    does by its metadata. Without the attribute its command is complete.
+    """
+    return bool(getattr(follower, "residual_on_pid", False))
 
 
 def checked_observation(observation: Array) -> np.ndarray:
@@ -144,6 +164,7 @@ class Baseline:
 
     def __init__(self, controller: Controller, config: Config):
         self.controller, self.name = controller, controller.name
+        self.residual_on_pid = residual_on_pid(controller)
         self.privileged: PrivilegedInfo | None = None
         self._believed_mass = config.plant.object_mass
         self._state: Any = None
@@ -175,7 +196,7 @@ class Baseline:
         if self.controller.needs_privileged:
             raise InputError(f"follower {self.name!r} needs to know where the CG is; it flies in simulation only")
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
-        return PrivilegedInfo(zero + self._believed_mass, zero, zero, zero)
+        return PrivilegedInfo.of_believed(zero + self._believed_mass)
 
 
 class Copy:

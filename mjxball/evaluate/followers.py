@@ -38,6 +38,7 @@ class UserFollower:
 
     def __init__(self, name: str, answer: Any):
         self.name, self._answer = name, answer
+        self.residual_on_pid = bool(_guarded(name, getattr, answer, "residual_on_pid", False))
 
     def reset(self) -> None:
         """See `Follower.reset`."""
@@ -55,6 +56,7 @@ class UserController:
     def __init__(self, name: str, controller: Any):
         self.name, self._controller = name, controller
         self.needs_privileged = bool(_guarded(name, getattr, controller, "needs_privileged", False))
+        self.residual_on_pid = bool(_guarded(name, getattr, controller, "residual_on_pid", False))
 
     def start(self, observation: Any) -> Any:
         """See `Controller.start`."""
@@ -72,6 +74,7 @@ class UserController:
 
 def _user_follower(name: str, made: Any, config: Config) -> Follower:
     found = _guarded(f"{name}(config)", made, config)
+    found = found.controller if isinstance(found, Baseline) else found
     has = {part for part in ("start", "step", "reset") if callable(_guarded(name, getattr, found, part, None))}
     if has >= {"start", "step"}:
         return Baseline(UserController(name, found), config)

@@ -79,6 +79,13 @@ def interface_of(metadata: dict[str, Any]) -> NetworkInterface:
     )
 
 
+def residual_on_pid(metadata: dict[str, Any]) -> bool:
+    """Whether a policy with `metadata` was trained with `follower.residual_on_pid`; the first files do not say."""
+    config = metadata.get("config")
+    follower = config.get("follower") if isinstance(config, dict) else None
+    return isinstance(follower, dict) and follower.get("residual_on_pid") is True
+
+
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     """Write `policy` to `path` atomically: a reader sees the old file or the complete new one."""
     check(policy, str(path))

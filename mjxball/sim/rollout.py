@@ -10,7 +10,7 @@ import numpy as np
 
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
-from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command
+from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command, residual_on_pid
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
@@ -140,7 +140,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     controller = _Together(flights)
     flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
     on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
-    privileged = make_privileged_info(config) if not on_pid.all() else lambda *_: None
+    privileged = make_privileged_info(config) if controller.needs_privileged else lambda *_: None
     loop = ClosedLoop(config, make_numpy_plant_step(config, physics), flown.sensors)
     state, observation = loop.start(flown.start, inputs.goal[0], flown.first, flown.delays)
     carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
@@ -165,7 +165,6 @@ class _Together:
     """The followers of `flights` as one controller of the whole batch, each for its own scenarios."""
 
     name = "together"
-    needs_privileged = True
 
     def __init__(self, flights: Flights):
         ends = np.cumsum([len(part) for _, part in flights])
@@ -178,8 +177,9 @@ class _Together:
                     f"{name} is a controller; mjxball.control.followers.Baseline({name}(config), config) flies it"
                 )
             follower.reset()
-        # 1 for every flight of a policy, whose base is the leader's whole PID; 0 for one of a baseline.
-        self.on_pid = np.array([1.0 - isinstance(follower, Baseline) for follower, part in flights for _ in part])
+        self.needs_privileged = any(isinstance(follower, Baseline) for follower, _ in flights)
+        # As each follower itself says: what class it is of does not matter.
+        self.on_pid = np.array([float(residual_on_pid(follower)) for follower, part in flights for _ in part])
 
     def start(self, observation: np.ndarray) -> tuple[()]:
         """Nothing: the followers remember themselves."""
@@ -190,7 +190,8 @@ class _Together:
         commands = []
         for follower, part in self._followers:
             if isinstance(follower, Baseline):
-                follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in privileged))
+                known = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in privileged))
+                follower.privileged = known if follower.controller.needs_privileged else known.without_truth()
             seen = observation[part]
             commands.append(checked_command(getattr(follower, "name", type(follower).__name__), follower(seen), seen))
         return state, np.concatenate(commands)

@@ -6,10 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import REPOSITORY
 
+from mjxball.baselines import Stay, make_baseline
 from mjxball.config import preset
+from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.followers import follower_factory
+from mjxball.policy import Policy
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
 
 SOURCE = """
 import numpy as np
@@ -46,3 +52,53 @@ def test_what_it_raises_has_a_line_and_a_shape(own: None) -> None:
     said = r"IndexError: .*, in own_followers.py line 13, given observations of shape \(2, 18\)"
     with pytest.raises(InputError, match=said):
         follower(np.zeros((2, 18)))
+
+
+class Wrapped:
+    """Any follower behind a class of its own, as a user's would be; it says nothing about integrals."""
+
+    def __init__(self, follower: Follower):
+        self.name, self._follower = "wrapped", follower
+
+    def reset(self) -> None:
+        self._follower.reset()
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        return self._follower(observation)
+
+
+class Declared(Wrapped):
+    residual_on_pid = True
+
+
+def test_shared_integrals_are_added_to_what_says_so_whatever_its_class() -> None:
+    """On Crazyflies, three seconds with a load that turns the stick: commands as the plant gets them."""
+    config, path = preset("flight"), REPOSITORY / "policies" / "flight.npz"
+    scenario = Scenario(omega=0.0, phase=1.57, amplitude=0.01, seconds=3.0)
+
+    def commands(follower: Follower) -> np.ndarray:
+        return simulate(config, follower, scenario, "newton-euler").follower_command
+
+    residual, complete = commands(Policy.load(path)), commands(Wrapped(Policy.load(path)))
+    np.testing.assert_array_equal(commands(Declared(Policy.load(path))), residual)
+    # A controller computes in float64.
+    np.testing.assert_allclose(commands(Baseline(Policy.load(path).controller, config)), residual, atol=1e-4)
+    assert np.abs(complete - residual).max() > 0.01
+    copied = commands(make_baseline("copy", config))
+    np.testing.assert_array_equal(commands(Wrapped(make_baseline("copy", config))), copied)
+
+
+def test_a_controller_that_hides_that_it_needs_the_true_cg_gets_zeros() -> None:
+    class Sly(Stay):
+        needs_privileged = False
+
+    class Honest(Stay):
+        needs_privileged = True
+
+    config = preset("paper")
+    sly, honest = Baseline(Sly(config), config), Baseline(Honest(config), config)
+    for follower in (sly, honest):
+        simulate(config, follower, Scenario(seconds=0.1, mass=0.3), "newton-euler")
+    assert honest.privileged.total_mass == pytest.approx(2.3)
+    assert (sly.privileged.believed_mass, sly.privileged.moment, sly.privileged.total_mass) == (0.3, 0.0, 0.0)
+    assert (sly.privileged.moment_acceleration, sly.privileged.thrust) == (0.0, None)
