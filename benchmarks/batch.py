@@ -9,10 +9,10 @@ import jax
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Controller, Follower
+from mjxball.control.followers import Baseline, Controller, Follower, residual_on_pid
 from mjxball.errors import InputError
-from mjxball.evaluate import metrics
-from mjxball.evaluate.metrics import Metrics
+from mjxball.evaluate.metrics import Metrics, results, rotor_limits
+from mjxball.evaluate.running_metrics import RunningMetrics, begin, update
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_plant_step
 from mjxball.policy import Policy
@@ -45,24 +45,24 @@ def fly_compiled(
     rewritten = physics == "newton-euler" and config.autopilot.kind == "ideal"
     step = (scalar_form if rewritten else jax.vmap)(make_plant_step(config, engine, jax_repeat))
     loop, privileged = ClosedLoop(config, step, flown.sensors), make_privileged_info(config)
-    on_pid = np.float32(not isinstance(follower, Baseline))
+    on_pid = np.float32(residual_on_pid(follower))
     leader, limit = config.plant.leader, config.scenario.termination_distance
 
-    def fly(load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> metrics.RunningMetrics:
+    def fly(load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> RunningMetrics:
         goal = inputs.goal[0]
         state, observation = loop.start(start, goal, first, flown.delays)
-        running = metrics.begin(start.position, goal, start.rotor_force, leader)
+        running = begin(start.position, goal, start.rotor_force, leader)
 
         def advance(carried: Any, now: Inputs) -> tuple[Any, None]:
             carry, row = control_step(loop, controller, privileged, load, carried[0], now, on_pid)
-            return (carry, metrics.update(carried[1], row, limit, most, leader)), None
+            return (carry, update(carried[1], row, limit, most, leader)), None
 
         carried = Carry(state, observation, controller.start(observation)), running
         return jax.lax.scan(advance, carried, inputs)[0][1]
 
-    given = (flown.load, flown.start, flown.inputs, flown.first, metrics.rotor_limits(config.plant, scenarios))
+    given = (flown.load, flown.start, flown.inputs, flown.first, rotor_limits(config.plant, scenarios))
     single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32 if leaf.dtype == np.float64 else None), given)
-    return metrics.results(jax.jit(fly)(*single))
+    return results(jax.jit(fly)(*single))
 
 
 def controller_of(follower: Follower) -> Controller:

@@ -16,7 +16,8 @@ from mjxball.control.followers import Controller, PrivilegedInfo
 from mjxball.control.geometry import team_geometry
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.env import TransportEnv
-from mjxball.evaluate.metrics import Metrics, RunningMetrics, begin, results, update
+from mjxball.evaluate.metrics import Metrics, results
+from mjxball.evaluate.running_metrics import RunningMetrics, begin, update
 from mjxball.physics.engine import PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import make_jax_plant_step

@@ -44,6 +44,7 @@ MODULES = (  # known by their last name
         "mjxball.control.network_interface",
         "mjxball.control.motors",
         "mjxball.evaluate.metrics",
+        "mjxball.evaluate.running_metrics",
         "mjxball.physics.engine",
     ),
     *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),

@@ -5,27 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from mjxball.arrays import Array
 from mjxball.config import Config, Plant
-from mjxball.rewards import paper_reward
+from mjxball.evaluate.running_metrics import RunningMetrics, begin, update
 from mjxball.sim.rollout import Flights, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.sim.trajectory import Trajectory
 
-RMSE_UNTIL = 20.0  # [s]
-PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
-STEADY_AFTER = 20.0  # [s]
-WAYPOINT_SECONDS = 10.0  # [s] after the last waypoint became the goal, before which nothing is steady
-SETTLED = (0.02, 0.10)  # of the error at the start of the last leg
-SATURATED_WITHIN = 1e-6  # of the largest rotor force
-# Likewise: a lagging rotor comes this near within 0.14 s, and to the exact limit only if it is asked for much longer.
-AT_LIMIT_WITHIN = 0.01
 NEVER_WITHIN = 0.1  # [s] of the end: not settled
-TINY, ROUNDING = 1e-9, 1e-5  # [s] of a time in float64, in float32
+ROUNDING = 1e-5  # [s] of a time in float32
 
 
 @dataclass(frozen=True)
@@ -50,6 +41,10 @@ class Metrics:
     rotor_power: float | None  # mean of sum F^1.5 over all rotors, over that at the start, hover
     command_spread: float | None  # rms of the followers' roll and pitch about their mean; None: one follower [rad]
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
+    rotor_limit_share: float | None = None  # as rotors_at_limit, of the one rotor that is longest at a limit
+    reached: float | None = None  # first time |e_o| is within `radius`, None: never [s]
+    arrival: float | None = None  # last time |e_o| exceeds `radius`, None: it does in the end [s]
+    late_error: float | None = None  # largest |e_o| after `deadline` [m]
 
     @property
     def peak(self) -> float:
@@ -64,134 +59,6 @@ class Metrics:
         return math.inf if self.failed else max(peaks, default=math.nan)
 
 
-class RunningMetrics(NamedTuple):
-    """Sums and extremes of n flights so far, NumPy or JAX arrays (n,) unless said otherwise."""
-
-    steps: Array  # () or (n,)
-    time: Array  # () or (n,), of the last step [s]
-    early: Array  # () or (n,), steps within the first 20 s
-    sums: Array  # (n, 9) over the steps of what `_taken` says
-    excess: Array  # (n, 9) what rounding has added to them: it may always round the same way
-    failed: Array
-    initial: Array  # |e_o| at the start of the leg [m]
-    leg: Array  # when the last waypoint became the goal [s]
-    steady_from: Array  # [s]
-    steady: Array  # steps in steady state
-    outside: Array  # (n, 2) last time |e_o| was beyond 2 % and 10 %, -inf: never [s]
-    peaks: Array  # (n, 4) x, y, z and the plane, NaN before the first
-    furthest: Array  # (n, 3) along each axis towards the goal [m]
-    tilt: Array
-    hover: Array  # (n, F, 4) the followers' rotor forces at the start [N]
-    hover_power: Array  # of all rotors there [N^1.5]
-    tilts: Array  # (n, F, 2) their last roll and pitch commands
-    target: Array  # (n, 3)
-
-
-def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -> RunningMetrics:
-    """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, N, 4)."""
-    xp = position.__array_namespace__()
-    hover = _of_followers(rotor_force, leader)
-    zero, none = xp.zeros_like(position[:, 0]), xp.full_like(position, xp.nan)
-    no_peaks = xp.concat([none, none[:, :1]], axis=-1)
-    scalar = xp.sum(zero[:0])
-    return RunningMetrics(
-        *(scalar, scalar, scalar),
-        *(xp.stack([zero] * 9, axis=-1),) * 2,  # sums, excess
-        zero > 1,
-        initial=_norm(target - position),
-        leg=zero,
-        steady_from=zero + STEADY_AFTER,
-        steady=zero,
-        outside=xp.full_like(position[:, :2], -xp.inf),
-        peaks=no_peaks,
-        furthest=none,
-        tilt=zero,
-        hover=hover,
-        hover_power=power_of(rotor_force),
-        tilts=xp.zeros_like(hover[..., :2]),
-        target=target,
-    )
-
-
-def update(
-    running: RunningMetrics,
-    row: Trajectory,
-    termination_distance: float,
-    rotor_force_max: Array | float,
-    leader: int = 0,
-) -> RunningMetrics:
-    """Take one control step of all flights into account; `leader` is the number of the drone that leads.
-
-    `rotor_force_max` [N] is one number, or (N,) or (n, N), see `rotor_limits`.
-    """
-    xp = row.position.__array_namespace__()
-    error = row.target - row.position
-    distance = _norm(error)
-    # Where the goal has changed, settling and peaks start again.
-    new = xp.any(row.target != running.target, axis=-1)
-    initial = xp.where(new, distance, running.initial)
-    steady_from = xp.where(new, row.time + WAYPOINT_SECONDS, running.steady_from)
-    steady_from = xp.where(steady_from > STEADY_AFTER, steady_from, STEADY_AFTER)
-    outside = xp.where(new[:, None], -xp.inf, running.outside)
-    beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
-    peaks = xp.where(new[:, None], xp.nan, running.peaks)
-    steady = row.time >= steady_from - TINY
-    errors = xp.concat([xp.abs(error), xp.hypot(error[:, :1], error[:, 1:2])], axis=-1)
-    sums, excess = compensated_sum(running.sums, running.excess, _taken(running, row, rotor_force_max, leader))
-    return RunningMetrics(
-        steps=running.steps + 1,
-        time=running.time * 0 + row.time,
-        early=running.early + xp.where(row.time <= RMSE_UNTIL + TINY, 1.0, 0.0),
-        sums=sums,
-        excess=excess,
-        failed=running.failed | row.diverged | ~(distance <= termination_distance),
-        initial=initial,
-        leg=xp.where(new, row.time, running.leg),
-        steady_from=steady_from,
-        steady=xp.where(new, 0.0, running.steady) + xp.where(steady, 1.0, 0.0),
-        outside=xp.where(beyond, row.time, outside),
-        peaks=xp.where(steady[:, None], xp.fmax(peaks, errors), peaks),
-        furthest=xp.fmax(running.furthest, row.position * xp.sign(row.target)),
-        tilt=xp.fmax(running.tilt, xp.hypot(row.euler[:, 0], row.euler[:, 1])),
-        hover=running.hover,
-        hover_power=running.hover_power,
-        tilts=xp.reshape(row.follower_command, (*running.hover.shape[:2], 3))[..., :2],
-        target=row.target,
-    )
-
-
-def _taken(running: RunningMetrics, row: Trajectory, rotor_force_max: Array | float, leader: int) -> Array:
-    """Contribution of one control step to `RunningMetrics.sums` (n, 9)."""
-    xp = row.position.__array_namespace__()
-    rotors = _of_followers(row.rotor_force, leader)
-    led, followed = row.leader_command[:, None], xp.reshape(row.follower_command, (*rotors.shape[:2], 3))
-    tilts = followed[..., :2]
-    most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
-    most = xp.broadcast_to(most, row.rotor_force.shape[:-1])[..., None]
-    saturated = _of_followers(near_limit(SATURATED_WITHIN, row.rotor_force, most), leader)
-    change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
-    apart = tilts - xp.mean(tilts, axis=-2, keepdims=True)
-    taken = (
-        xp.where(row.time <= RMSE_UNTIL + TINY, _norm(row.target - row.position) ** 2, 0.0),
-        xp.mean((followed - led) ** 2, axis=(-2, -1)),
-        xp.where(running.steps < PAPER_STEPS, xp.mean(paper_reward(led, followed), axis=-1), 0.0),
-        xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
-        xp.where(running.steps > 0, change, 0.0),
-        xp.mean(saturated, axis=(-2, -1)),
-        xp.max(near_limit(AT_LIMIT_WITHIN, row.rotor_force, most), axis=(-2, -1)),
-        power_of(row.rotor_force),
-        xp.mean(apart**2, axis=(-2, -1)),
-    )
-    return xp.stack(taken, axis=-1)
-
-
-def compensated_sum(total: Array, excess: Array, value: Array) -> tuple[Array, Array]:
-    """(`total` + `value`, what rounding has added to it so far), given `excess`, the latter before (Kahan 1965)."""
-    lacking = value - excess
-    summed = total + lacking
-    return summed, (summed - total) - lacking
-
-
 def results(running: RunningMetrics) -> list[Metrics]:
     """Metrics of every flight."""
     t = RunningMetrics(*(np.asarray(leaf, float) for leaf in running))
@@ -200,8 +67,10 @@ def results(running: RunningMetrics) -> list[Metrics]:
         peaks = np.where((t.steady > 1)[:, None], t.peaks, np.nan)
         goal = np.where(t.target == 0, np.nan, t.target)
         over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / np.abs(goal))
+        last = t.time - NEVER_WITHIN - ROUNDING
         settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
-        settled = np.where(t.outside >= (t.time - NEVER_WITHIN - ROUNDING)[..., None], np.nan, settled)
+        settled = np.where(t.outside >= last[..., None], np.nan, settled)
+        arrival = np.where(np.isnan(t.radius) | (t.beyond >= last), np.nan, np.fmax(t.beyond, 0.0))
         columns = {
             "rmse": np.sqrt(square / t.early),
             "settling_time": settled[:, 0],
@@ -218,8 +87,12 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "smoothness": np.sqrt(change / np.maximum(t.steps - 1, 1)),
             "saturation": saturated / t.steps,
             "rotors_at_limit": limited / t.steps,
+            "rotor_limit_share": t.limited.max(axis=(-2, -1)) / t.steps,
             "rotor_power": power / t.steps / t.hover_power,
             "command_spread": np.sqrt(spread / t.steps) if t.hover.shape[1] > 1 else spread * np.nan,
+            "reached": t.reached,
+            "arrival": arrival,
+            "late_error": t.late_error,
         }
     rows = zip(*columns.values(), strict=True)
     named = (dict(zip(columns, map(_number, row), strict=True)) for row in rows)
@@ -237,54 +110,45 @@ def rotor_limits(plant: Plant, scenarios: Sequence[Scenario]) -> np.ndarray:
     return found
 
 
-def fly_and_measure(config: Config, flights: Flights, physics: str = "mjx") -> tuple[Trajectory, list[Metrics]]:
-    """Every flight of `simulate_batch`, with its metrics."""
+def fly_and_measure(
+    config: Config,
+    flights: Flights,
+    physics: str = "mjx",
+    radius: Array | float = math.nan,
+    deadline: Array | float = math.nan,
+) -> tuple[Trajectory, list[Metrics]]:
+    """Every flight of `simulate_batch`, with its metrics; `radius` and `deadline` as in `begin`."""
     flown, scenarios = simulate_batch(config, flights, physics), [one for _, part in flights for one in part]
     limit, most = config.scenario.termination_distance, rotor_limits(config.plant, scenarios)
-    return flown, measure_batch(flown, limit, most, config.plant.leader)
+    return flown, measure_batch(flown, limit, most, config.plant.leader, radius, deadline)
 
 
 def measure(
-    flight: Trajectory, termination_distance: float = 2.5, rotor_force_max: Array | float = 5.5, leader: int = 0
+    flight: Trajectory,
+    termination_distance: float = 2.5,
+    rotor_force_max: Array | float = 5.5,
+    leader: int = 0,
+    radius: float = math.nan,
+    deadline: float = math.nan,
 ) -> Metrics:
     """Metrics of one recorded flight (no batch axis)."""
-    return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader)[0]
+    return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader, radius, deadline)[0]
 
 
 def measure_batch(
-    flights: Trajectory, termination_distance: float, rotor_force_max: Array | float = 5.5, leader: int = 0
+    flights: Trajectory,
+    termination_distance: float,
+    rotor_force_max: Array | float = 5.5,
+    leader: int = 0,
+    radius: Array | float = math.nan,
+    deadline: Array | float = math.nan,
 ) -> list[Metrics]:
-    """Metrics of every flight of a recorded batch."""
+    """Metrics of every flight of a recorded batch; `radius` and `deadline` as in `begin`."""
     first = flights.row(0)
-    running = begin(first.position, first.target, first.rotor_force, leader)
+    running = begin(first.position, first.target, first.rotor_force, leader, radius, deadline)
     for number in range(len(flights.time)):
         running = update(running, flights.row(number), termination_distance, rotor_force_max, leader)
     return results(running)
-
-
-def _of_followers(rotor_force: Array, leader: int) -> Array:
-    """(n, F, 4) of (n, N, 4)."""
-    if leader == 0:
-        return rotor_force[:, 1:]
-    xp = rotor_force.__array_namespace__()
-    return xp.concat([rotor_force[:, :leader], rotor_force[:, leader + 1 :]], axis=1)
-
-
-def near_limit(share: float, force: Array, most: Array) -> Array:
-    """1 where a rotor's force is within `share` of `most` of 0 or `most`, else 0; NaN of a force that nobody knows."""
-    xp = force.__array_namespace__()
-    found = (force <= share * most) | (force >= (1 - share) * most)
-    return xp.where(xp.isnan(force), xp.nan, xp.astype(found, force.dtype))
-
-
-def power_of(rotor_force: Array) -> Array:
-    """(...,) of (..., N, 4): what air takes from rotors that hover, but for a factor of their size [N^1.5]."""
-    xp = rotor_force.__array_namespace__()
-    return xp.sum(xp.maximum(rotor_force, xp.zeros_like(rotor_force)) ** 1.5, axis=(-2, -1))
-
-
-def _norm(vector: Array) -> Array:
-    return vector.__array_namespace__().sqrt((vector * vector).sum(axis=-1))
 
 
 def _number(value: float) -> float | None:

@@ -12,8 +12,8 @@ from mjxball.baselines import make_baseline
 from mjxball.config import Config, ball_limit
 from mjxball.control import rotations
 from mjxball.control.followers import Follower
-from mjxball.evaluate.metrics import STEADY_AFTER
 from mjxball.evaluate.plots import Figure, panels, thinned
+from mjxball.evaluate.running_metrics import STEADY_AFTER
 from mjxball.plotting import INK, follower_styles, legend_above, line, logarithmic, rendered
 from mjxball.policy import Policy
 from mjxball.sim.rollout import check_rate, simulate_batch

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mjxball.config import preset
-from mjxball.evaluate.metrics import Metrics, begin, measure, measure_batch, results, rotor_limits, update
+from mjxball.evaluate.metrics import Metrics, measure, measure_batch, results, rotor_limits
+from mjxball.evaluate.running_metrics import begin, update
 from mjxball.sim.scenario import Scenario
 from mjxball.sim.trajectory import Trajectory
 
@@ -185,3 +186,30 @@ def test_a_batch_is_measured_as_its_flights() -> None:
     flights = [flight(approach(rate)) for rate in (0.1, 1.0, 3.0)]
     batch = Trajectory(TIME, *(np.stack(part, axis=1) for part in zip(*(one[1:] for one in flights), strict=True)))
     assert measure_batch(batch, 2.5) == [of(one) for one in flights]
+
+
+def test_arrival_is_the_last_time_beyond_a_radius_of_each_flight() -> None:
+    """An error that decays as exp(-t) from 1 m along x; a bump at 12 s, between two radii, brings it out again."""
+    time = np.arange(1501) * 0.02
+    error = np.exp(-time) + np.where(np.abs(time - 12.0) < 0.1, 0.03, 0.0)
+    made = flight(np.stack([1.0 - error, 0 * time, 0 * time], axis=1), target=np.tile([1.0, 0.0, 0.0], (1501, 1)))
+    wide, narrow, none = (measure(made, 2.5, radius=radius, deadline=10.0) for radius in (0.05, 0.02, np.nan))
+    assert wide.arrival == pytest.approx(-np.log(0.05), abs=0.02)
+    assert wide.reached == pytest.approx(wide.arrival, abs=0.021)
+    assert narrow.reached == pytest.approx(-np.log(0.02), abs=0.02)
+    assert narrow.arrival == pytest.approx(12.08, abs=0.021)
+    assert wide.late_error == pytest.approx(0.03, abs=1e-4)
+    assert (none.reached, none.arrival) == (None, None)
+    never, before = measure(made, 2.5, radius=1e-15), measure(made, 2.5, radius=2.0)
+    assert (never.reached, never.arrival, never.late_error) == (None, None, None)
+    assert (before.reached, before.arrival) == (0.0, 0.0)
+
+
+def test_share_at_a_limit_of_the_one_rotor_that_is_there_longest() -> None:
+    """Three rotors in turn, each for a fifth of the time: some rotor is at a limit three fifths of it."""
+    rotors = np.full((1500, 2, 4), 2.0)
+    for number in range(3):
+        rotors[300 * number : 300 * (number + 1), number % 2, number] = 5.49
+    found = measure(flight(approach()[:1500], rotor_force=rotors), 2.5)
+    assert found.rotor_limit_share == pytest.approx(0.2)
+    assert found.rotors_at_limit == pytest.approx(0.6)
