@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any
 
 from batch import fly_compiled
+from bounds import BOUNDS, Bound, limits
 from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
-from mjxball.bench.success import BOUNDS, Bound, limits
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import hashlib
 import json
 import shlex
 import sys
+import time as clock
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,14 +30,16 @@ import numpy as np
 
 from mjxball import cli, running
 from mjxball.bench import NAME, VERSION
-from mjxball.bench.entry import CONDITIONS, table
-from mjxball.bench.references import bars
-from mjxball.bench.success import successes, summary
-from mjxball.bench.tracks import TRACKS, World, worlds_of
+from mjxball.bench.draw import Group, groups_of
+from mjxball.bench.entry import by_condition, table
+from mjxball.bench.evaluation import Result, fresh_key, with_seed
+from mjxball.bench.success import reasons
+from mjxball.bench.tracks import TRACKS
 from mjxball.config import Config
 from mjxball.control import observation, rotations
 from mjxball.errors import InputError
-from mjxball.evaluate import metrics
+from mjxball.evaluate.metrics import results, rotor_limits
+from mjxball.evaluate.running_metrics import begin, update
 from mjxball.files import write_atomically
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState, has_diverged
@@ -60,21 +64,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     cli.output_file(options.out, ".json")
     try:
-        from foundation_policy import Raptor
+        import foundation_policy
     except ImportError:
         raise InputError("RAPTOR is not installed: pip install foundation-policy") from None
     found: dict[str, Any] = {}
+    key, times = fresh_key(), []
     for track in PAIRS:
-        (world,) = worlds_of(track, options.draw)
-        flown = fly_world(world, Raptor())
-        met = successes(flown, bars(track, options.draw, 0))
+        (group,) = groups_of(track, options.draw)
+        begun = clock.process_time()
+        flown = by_condition(fly_group(group, track, key, foundation_policy.Raptor()))
+        times.append((clock.process_time() - begun) * PERIOD / sum(one.scenario.seconds for one in group.flights))
         # There is no attitude command whose change could be measured.
-        found[track] = {
-            name: {**summary(flown[row::2], met[row::2]), "command_change": None} for row, name in enumerate(CONDITIONS)
-        }
+        found[track] = {name: {**values, "command_change": None} for name, values in flown.items()}
+    digest = hashlib.sha256(Path(foundation_policy.__file__).read_bytes()).hexdigest()
     entry = {
-        **{"benchmark": NAME, "version": VERSION, "draw": options.draw, "follower": "raptor"},
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        **{"benchmark": NAME, "version": VERSION, "draw": options.draw, "key": key, "follower": "raptor"},
+        **{"sha256": digest, "date": datetime.datetime.now(datetime.UTC).date().isoformat(), "cpu_time": max(times)},
         "tracks": found,
         "not_flown": {name: BESIDE for name in TRACKS if name not in PAIRS},
         "command": shlex.join(["python", "benchmarks/raptor.py", *(arguments or sys.argv[1:])]),
@@ -85,12 +90,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def fly_world(world: World, raptor: Any) -> list[metrics.Metrics]:
-    """Metrics of every flight, undisturbed and disturbed in turn; `raptor` keeps a memory for each drone of each."""
-    scenarios = [one for pair in world.scenarios for one in pair]
-    plant = dataclasses.replace(world.config.plant, layout="x")
-    timing = dataclasses.replace(world.config.timing, control_period=PERIOD, physics_steps=STEPS)
-    config = dataclasses.replace(world.config, plant=plant, timing=timing)
+def fly_group(group: Group, track: str, key: str, raptor: Any) -> list[Result]:
+    """Every flight of a track; `raptor` keeps a memory for each drone of each."""
+    scenarios = [with_seed(one, f"{key}:{track}", 0) for one in group.flights]
+    plant = dataclasses.replace(group.config.plant, layout="x")
+    timing = dataclasses.replace(group.config.timing, control_period=PERIOD, physics_steps=STEPS)
+    config = dataclasses.replace(group.config, plant=plant, timing=timing)
     step, most = _rotor_step(config), np.array(plant.of_drones("rotor_force_max"))[:, None]
     flown = scenario_arrays(config, scenarios)
     state, inputs, goal = flown.start, flown.inputs, flown.inputs.goal[0]
@@ -103,13 +108,14 @@ def fly_world(world: World, raptor: Any) -> list[metrics.Metrics]:
     raptor.reset()
     follower, nothing = plant.followers[0], np.zeros((len(goal), 3))
     sensed, measured = flown.sensors.start(truth(state, follower), flown.first, flown.delays)
-    running = metrics.begin(state.position, goal, state.rotor_force, plant.leader)
-    limits = metrics.rotor_limits(plant, scenarios)
+    radii, deadlines = (np.array([getattr(one, name) for one in group.flights]) for name in ("radius", "deadline"))
+    running = begin(state.position, goal, state.rotor_force, plant.leader, radii, deadlines)
+    limits = rotor_limits(plant, scenarios)
     command = 2 * np.clip(state.rotor_force / most, 0.0, 1.0) - 1
     for number, time in enumerate(inputs.time):
         if number % 2 == 0:  # the 50 Hz of every other follower's flights
             row = Trajectory.of(state, time, goal, TeamCommands(nothing, nothing), diverged=has_diverged(state))
-            running = metrics.update(running, row, config.scenario.termination_distance, limits, plant.leader)
+            running = update(running, row, config.scenario.termination_distance, limits, plant.leader)
         seen = [truth(state, plant.leader), measured] if plant.leader < follower else [measured, truth(state, 1)]
         given = np.stack([see(own, mount, goal) for own, mount in zip(seen, mounts, strict=True)], axis=1)
         given = np.concatenate([given, command], axis=-1)
@@ -117,7 +123,10 @@ def fly_world(world: World, raptor: Any) -> list[metrics.Metrics]:
         command = np.clip(answer, -1.0, 1.0).reshape(command.shape)
         state = step(state, most * ((command + 1) / 2), flown.load)
         sensed, measured = flown.sensors.step(sensed, truth(state, follower), inputs.sample.at(number))
-    return metrics.results(running)
+    return [
+        Result(0, flight, one, reasons(one, flight.deadline))
+        for flight, one in zip(group.flights, results(running), strict=True)
+    ]
 
 
 def see(own: np.ndarray, mount: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from bounds import Bound, limits, numbers
 from harness import Row, arguments, say, table, write
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
-from mjxball.bench.success import Bound, limits, numbers
 from mjxball.bench.tracks import RIG_LENGTH
 from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Controller, Copy

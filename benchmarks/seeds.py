@@ -37,12 +37,12 @@ import numpy as np
 import cells
 import stability
 from batch import fly_compiled
+from bounds import Bound, limits
 from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
 from mjxball.arrays import Array
 from mjxball.baselines import CONTROLLERS, make_baseline
 from mjxball.bench.scores import by_variant, fly_suites
-from mjxball.bench.success import Bound, limits
 from mjxball.bench.suites import Suite, Variant
 from mjxball.config import Config, preset
 from mjxball.control.network import Network

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from batch import fly_compiled
+from bounds import Bound, limits
 from harness import Row, arguments, say, write
 from mjxball import running
 from mjxball.baselines import make_baseline
-from mjxball.bench.success import Bound, limits
 from mjxball.config import Config, preset
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics

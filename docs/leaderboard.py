@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Tables of the leaderboard, made of the entries in benchmarks/leaderboard/ when the site is built.
 
-`python docs/leaderboard.py` prints them; an entry of another version, of other flights or of changed
-sources is refused.
+`python docs/leaderboard.py` prints them; an entry of another version or of other flights, or one that no flights can
+give, is refused.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mjxball.bench.entry import CONDITIONS, cells, read_entry
+from mjxball.bench import CONDITIONS
+from mjxball.bench.checks import read_entry
+from mjxball.bench.entry import HEADS, cells
 from mjxball.bench.tracks import TRACKS
 from mjxball.errors import InputError
 from mjxball.running import run_command
 
 ENTRIES = Path(__file__).parents[1] / "benchmarks" / "leaderboard"
-COLUMNS = (
-    "| follower | | success % | 95 % | failed % | settles s | 90 % peak mm | limit % | change mrad | date, commit |"
-)
+COLUMNS = ["follower", "", *HEADS, "date, commit"]
 
 
 @functools.cache
@@ -34,13 +34,12 @@ def entries() -> list[dict[str, Any]]:
 
 
 def table(track: str) -> str:
-    """The rows of one track: the newest first, those of one day by their success."""
-    flown = sorted(
-        (entry for entry in entries() if track in entry["tracks"]),
-        key=lambda entry: (entry["date"], [entry["tracks"][track][one]["met"] for one in CONDITIONS]),
-        reverse=True,
+    """The rows of one track, the most successful in the world first."""
+    flown = [entry for entry in entries() if track in entry["tracks"]]
+    flown.sort(
+        key=lambda entry: [entry["tracks"][track][one]["succeeded"] for one in reversed(CONDITIONS)], reverse=True
     )
-    lines = [COLUMNS, "|---|---|---|---|---|---|---|---|---|---|"]
+    lines = [f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
     for entry in flown:
         beside = ((f"`{entry['follower']}`", entry["date"]), ("", entry["commit"][:7]))
         for condition, (called, made) in zip(CONDITIONS, beside, strict=True):

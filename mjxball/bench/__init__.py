@@ -1,8 +1,10 @@
-"""mjxball-bench: the same flights for every follower, compared with classical followers that know the plant.
+"""mjxball-bench: the same flights for every follower, compared with a controller that knows everything.
 
-`tracks` has the flights, `followers` loads followers, `references` has classical results, `success` the criterion,
-`entry` the result file; docs/leaderboard.py tabulates entries. Flights and criterion of a version never change. Besides
-the benchmark: `suites` of single difficulties, `scores` of followers on them, `report`.
+`tracks` samples flights, `draw` selects those that the oracle succeeds in and stores them (`store`), `process` runs a
+follower in a process of its own (`child`), `evaluation` flies it, `success` is the criterion, `entry` the result file
+and `reading` its checks; docs/leaderboard.py tabulates entries. Flights and criterion of a version never change.
+Besides the benchmark: `suites` of single difficulties, `scores` of followers on them, `report`.
 """
 
-NAME, VERSION = "mjxball-bench", 1
+NAME, VERSION = "mjxball-bench", 2
+CONDITIONS = ("calm", "world")

@@ -2,170 +2,126 @@
 
 from __future__ import annotations
 
+import csv
 import datetime
-import re
+import io
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-from mjxball.bench import NAME, VERSION
-from mjxball.bench.followers import FollowerFactory, checked
-from mjxball.bench.references import bars
-from mjxball.bench.success import successes, summary
-from mjxball.bench.tracks import FLIGHTS, TRACKS, worlds_of
+from mjxball.bench import CONDITIONS, NAME, VERSION
+from mjxball.bench.draw import groups_of
+from mjxball.bench.evaluation import Result, check_key, evaluate, fresh_key
+from mjxball.bench.followers import identity
+from mjxball.bench.process import FollowerProcess, RefusalError
+from mjxball.bench.success import REASONS, interval, summary
+from mjxball.bench.tracks import TRACKS
 from mjxball.errors import InputError
-from mjxball.evaluate.metrics import Metrics
-from mjxball.files import read_text
-from mjxball.reading import parse_json
 
-CONDITIONS = ("undisturbed", "disturbed")
-HEADS = ["track", "", "success %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
-# Keys of an entry and their types, besides the benchmark and its version.
-KINDS = {
-    **{"draw": int, "follower": str, "date": str, "command": str, "commit": str},
-    **{"versions": dict, "tracks": dict, "not_flown": dict},
+HEADS = [
+    "success %",
+    "95 %",
+    *(f"{name} %" for name in REASONS),
+    "arrival",
+    "late mm",
+    "power",
+    "limit %",
+    "change mrad",
+]
+# Values of a condition that `success.summary` gives beside counts, with the factor and digits of their column.
+VALUES = {
+    **{"arrival_ratio": (1.0, 2), "late_error_90": (1e3, 1), "rotor_power": (1.0, 3)},
+    **{"rotor_limit_share": (100.0, 1), "command_change": (1e3, 1)},
 }
-MAX_VALUE = 1e9  # bound on any value
-SHARES = ("met", "low", "high", "failed")  # required values of one condition
-VALUES = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
+FLIGHT_COLUMNS = (
+    *("track", "plant", "condition", "candidate", "goal_x", "goal_y", "goal_z", "mass", "radius", "oracle_arrival"),
+    *("deadline", "reached", "arrival", "late_error", "rotor_limit_share", "rotor_power", "reasons"),
+)
+Results = dict[str, list[Result]]  # of tracks
 
 
 def make_entry(
-    name: str,
-    make: FollowerFactory,
+    text: str,
     tracks: Sequence[str],
     draw: int,
+    key: str | None = None,
     progress: Callable[[str], None] = lambda text: None,
-) -> dict[str, Any]:
-    """The entry of a follower, without the keys on the machine that `mjxball.commands` adds.
+) -> tuple[dict[str, Any], Results]:
+    """The entry of the follower that `text` names, without the keys that `mjxball.commands` adds, and all flights.
 
-    A track whose plants the follower refuses is left out, with the reason. Raises InputError if it refuses all tracks.
+    `key` repeats an evaluation. A track whose plants the follower refuses is left out, with the reason. Raises
+    InputError if it refuses all tracks, or on no track answers as it should.
     """
     if draw < 0:
         raise InputError(f"--draw must not be negative, but is {draw}")
-    results: dict[str, Any] = {}
+    key = fresh_key() if key is None else check_key(key)
+    name, digest = identity(text)
+    found: Results = {}
     refused: dict[str, str] = {}
-    for track in tracks:
-        try:
-            for world in worlds_of(track, draw):
-                make(world.config)
-        except InputError as error:
-            refused[track] = str(error)
-            continue
-        results[track] = measure(track, draw, make, progress)
-    if not results:
+    times = []
+    with FollowerProcess(name, text) as process:
+        for track in tracks:
+            try:
+                for group in groups_of(track, draw):
+                    process.follower(group.config)
+            except RefusalError as error:
+                refused[track] = str(error)
+                continue
+            times.append(process.check_cpu_time(groups_of(track, draw)[0].config))
+            found[track] = evaluate(track, draw, key, process, progress)
+    if not found:
         raise InputError(f"{name} flies no track: {next(iter(refused.values()))}")
     date = datetime.datetime.now(datetime.UTC).date().isoformat()
-    head = {"benchmark": NAME, "version": VERSION, "draw": draw, "follower": name, "date": date}
-    return {**head, "tracks": results, "not_flown": refused}
+    head = {"benchmark": NAME, "version": VERSION, "draw": draw, "key": key, "follower": name, "sha256": digest}
+    results = {track: by_condition(flown) for track, flown in found.items()}
+    return {**head, "date": date, "cpu_time": max(times), "tracks": results, "not_flown": refused}, found
 
 
-def measure(track: str, draw: int, make: FollowerFactory, progress: Callable[[str], None]) -> dict[str, dict[str, Any]]:
-    """Results of the follower on `track`, by condition: undisturbed and disturbed.
-
-    Raises InputError if it refuses the track's plants or fails the checks of `mjxball.bench.followers`.
-    """
-    flown: list[Metrics] = []
-    succeeded: list[bool] = []
-    worlds = worlds_of(track, draw)
-    # Check all followers before the first flight; on the first plant with as many calls as a flight has.
-    steps = round(worlds[0].scenarios[0][0].seconds / worlds[0].config.timing.control_period)
-    entrants = [checked(make, world.config, *[] if number else [steps]) for number, world in enumerate(worlds)]
-    for number, (world, follower) in enumerate(zip(worlds, entrants, strict=True)):
-        progress(f"{track}: {number + 1}/{len(worlds)}")
-        (mine,) = world.fly([follower], [one for pair in world.scenarios for one in pair])
-        flown, succeeded = [*flown, *mine], [*succeeded, *successes(mine, bars(track, draw, number))]
-    return {name: summary(flown[row::2], succeeded[row::2]) for row, name in enumerate(CONDITIONS)}
+def by_condition(flown: Sequence[Result]) -> dict[str, dict[str, Any]]:
+    """`success.summary` of a track's flights in each condition."""
+    parts = {name: [one for one in flown if one.flight.condition == name] for name in CONDITIONS}
+    return {
+        name: summary(
+            [one.metrics for one in part], [one.failures for one in part], [one.flight.oracle_arrival for one in part]
+        )
+        for name, part in parts.items()
+    }
 
 
-def read_entry(path: Path) -> dict[str, Any]:
-    """An entry that the leaderboard can show: of this version, with all published flights of each track, from a commit.
-
-    Raises InputError with one sentence for anything else.
-    """
-    text = read_text(path, "entry")
-    try:
-        entry = parse_json(text)
-    except (ValueError, RecursionError):
-        raise InputError(f"entry {path} is no JSON") from None
-    if not isinstance(entry, dict) or entry.get("benchmark") != NAME:
-        raise InputError(f"{path} is no entry of {NAME}")
-    other = entry.get("version")
-    if other != VERSION or isinstance(other, bool):
-        raise InputError(f"entry {path} is of version {other!r} of {NAME}, and this is version {VERSION}")
-    _check_kinds(path, entry)
-    if not re.fullmatch(r"[\w.:+-]+", entry["follower"]) or not _is_date(entry["date"]):
-        raise InputError(f"entry {path} has no name of one word as follower, or no date as 2026-01-31")
-    if not entry["tracks"] or set(entry["tracks"]) & set(entry["not_flown"]):
-        raise InputError(f"entry {path} has no track, or one that was flown and not flown")
-    for track, results in entry["tracks"].items():
-        for condition in CONDITIONS:
-            if track not in TRACKS or not isinstance(results, dict) or not _measured(results.get(condition)):
-                raise InputError(f"entry {path} lacks valid results of track {track}, {condition}")
-    flown = {results[condition]["flights"] for results in entry["tracks"].values() for condition in CONDITIONS}
-    if flown != {FLIGHTS} or entry["draw"] != 0:
-        counts = ", ".join(map(str, sorted(flown)))
-        raise InputError(f"entry {path} is of {counts} flights of draw {entry['draw']}; ranked are {FLIGHTS} of draw 0")
-    if not re.fullmatch(r"[0-9a-f]{7,40}", entry["commit"]):
-        raise InputError(f"entry {path} is of commit {entry['commit']!r}; fly it from a clean checkout of one")
-    return entry
-
-
-def _check_kinds(path: Path, entry: dict[str, Any]) -> None:
-    if missing := sorted(set(KINDS) - set(entry)):
-        raise InputError(f"entry {path} is not whole: {', '.join(missing)} is missing")
-    for name, kind in KINDS.items():
-        if type(entry[name]) is not kind:
-            raise InputError(f"entry {path} has {name} {entry[name]!r}, which is no {kind.__name__}")
-
-
-def _measured(values: Any) -> bool:
-    """Whether `values` are one condition's results, as `success.summary` returns them."""
-    if not isinstance(values, dict) or set(values) != VALUES or type(values["flights"]) is not int:
-        return False
-    if not all(values[name] is None or type(values[name]) in (int, float) for name in VALUES):
-        return False
-    if any(values[name] is None for name in SHARES):
-        return False
-    low, met, high, failed = (values[name] for name in ("low", "met", "high", "failed"))
-    limit = values["rotors_at_limit"] or 0
-    return (
-        0 <= low <= met <= high <= 1
-        and failed >= 0
-        and met + failed <= 1 + 1e-9
-        and 0 <= limit <= 1
-        and all(0 <= (values[name] or 0) < MAX_VALUE for name in VALUES)
-    )
-
-
-def _is_date(text: str) -> bool:
-    """Whether `text` is a date such as 2026-01-31."""
-    try:
-        return datetime.date.fromisoformat(text).isoformat() == text
-    except ValueError:
-        return False
+def flight_table(found: Results) -> str:
+    """A CSV table of all flights, a row each: s, m, kg; empty where a flight has no such value."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(FLIGHT_COLUMNS)
+    for track, flown in found.items():
+        for plant, flight, metrics, failures in flown:
+            scenario = flight.scenario
+            place = (track, plant, flight.condition, flight.candidate, *scenario.goal, scenario.mass)
+            wanted = (flight.radius, flight.oracle_arrival, flight.deadline)
+            own = (metrics.reached, metrics.arrival, metrics.late_error, metrics.rotor_limit_share, metrics.rotor_power)
+            writer.writerow([*place, *wanted, *own, " ".join(failures)])
+    return stream.getvalue()
 
 
 def table(entry: dict[str, Any]) -> str:
     """The entry as a text table, one line per track and condition."""
-    rows: list[Sequence[str]] = [HEADS]
+    rows: list[Sequence[str]] = [["track", "", *HEADS]]
     for track, found in entry["tracks"].items():
         rows += [(TRACKS[track].title, condition, *cells(found[condition])) for condition in CONDITIONS]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADS))]
-    sides = [str.ljust, str.ljust, *[str.rjust] * (len(HEADS) - 2)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    sides = [str.ljust, str.ljust, *[str.rjust] * len(HEADS)]
     lines = ["  ".join(side(text, width) for side, text, width in zip(sides, row, widths, strict=True)) for row in rows]
     left_out = [f"{TRACKS[track].title}: not flown, {why}" for track, why in entry["not_flown"].items()]
     return "\n".join([*(line.rstrip() for line in lines), *left_out])
 
 
 def cells(found: dict[str, Any]) -> tuple[str, ...]:
-    """Results of one condition as text: success, its interval, failures, settling, peak, rotors at a limit, change."""
-
-    def shown(name: str, factor: float, digits: int) -> str:
-        return "-" if found[name] is None else f"{factor * found[name]:.{digits}f}"
-
-    interval = f"{100 * found['low']:.0f} - {100 * found['high']:.0f}"
-    return (
-        *(shown("met", 100, 0), interval, shown("failed", 100, 0), shown("settling_50", 1, 2)),
-        *(shown("peak_90", 1e3, 1), shown("rotors_at_limit", 100, 1), shown("command_change", 1e3, 1)),
-    )
+    """Results of one condition as text, in the order of `HEADS`; a dash: never, or nothing to measure."""
+    flights = found["flights"]
+    low, high = interval(found["succeeded"], flights)
+    counts = [f"{100 * found['reasons'][name] / flights:.0f}" for name in REASONS]
+    values = [
+        "-" if found[name] is None else f"{factor * found[name]:.{digits}f}"
+        for name, (factor, digits) in VALUES.items()
+    ]
+    share = f"{100 * found['succeeded'] / flights:.0f}"
+    return (share, f"{100 * low:.0f} - {100 * high:.0f}", *counts, *values)

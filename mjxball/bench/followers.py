@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
+import hashlib
+import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,16 @@ import numpy as np
 
 from mjxball.baselines import CONTROLLERS
 from mjxball.config import Config
-from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError, said
 from mjxball.evaluate.followers import FollowerFactory, answered, follower_factory
 from mjxball.evaluate.policies import load_policy
+from mjxball.files import read_bytes
 from mjxball.policy import Policy, policy_path, shipped_policies
+from mjxball.policy.file import residual_on_pid
+from mjxball.reading import parse_json
 
-__all__ = ["FollowerFactory", "checked", "entrant"]
-
-MAX_CALL_TIME = 0.020  # largest median time of CALLS consecutive calls for one flight [s]
-CALLS = 20
+BASELINES = Path(__file__).parents[1] / "baselines"
 TYPES = {"observation": "tensor(float)", "memory": "tensor(float)", "start": "tensor(bool)"}  # of inputs
 UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # with privileged information, or no controllers
 
@@ -38,6 +38,43 @@ def entrant(text: str) -> tuple[str, FollowerFactory]:
     if path.suffix == ".onnx":
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
+    check_name(text)
+    return follower_factory(text, "follower")
+
+
+def identity(text: str) -> tuple[str, str]:
+    """(name, SHA-256) of the follower that `text` names, without running anything of it; InputError if there is none.
+
+    The hash is of its file, of the file of its module, or of all classical followers for one of them.
+    """
+    path = policy_path(text)
+    if path.suffix in (".npz", ".onnx"):
+        return path.stem, hashlib.sha256(read_bytes(path, "", 2**30)).hexdigest()
+    check_name(text)
+    sources = sorted(BASELINES.glob("*.py")) if text in CONTROLLERS else [_source(text)]
+    content = b"".join(read_bytes(source) for source in sources)
+    return text.rpartition(":")[2], hashlib.sha256(content).hexdigest()
+
+
+def _source(text: str) -> Path:
+    """The file of the module in module:Class, which is not imported; searches the current directory too."""
+    module, places = text.partition(":")[0], [*sys.path, str(Path.cwd())]
+    found, parts = None, module.split(".")
+    for number in range(len(parts)):
+        found = PathFinder.find_spec(".".join(parts[: number + 1]), places)
+        if found is None:
+            raise InputError(
+                f"follower {text}: there is no module {module} here or among the installed packages; install it or run "
+                "from its directory"
+            )
+        places = list(found.submodule_search_locations or [])
+    if found is None or found.origin is None:
+        raise InputError(f"follower {text}: module {module} has no source file")
+    return Path(found.origin)
+
+
+def check_name(text: str) -> None:
+    """Raise InputError unless `text` is module:Class or the name of a classical follower that is ranked."""
     if text in UNRANKED:
         raise InputError(f"{text} is not ranked: it uses information that no follower can have, or is no controller")
     if text not in CONTROLLERS and ":" not in text:
@@ -48,7 +85,6 @@ def entrant(text: str) -> tuple[str, FollowerFactory]:
         raise InputError(
             f"the benchmark flies a file .npz or .onnx, module:Class, or one of {', '.join(names)}, not {text!r}"
         )
-    return follower_factory(text, "follower")
 
 
 def _loaded(path: Path, config: Config) -> Policy:
@@ -60,10 +96,11 @@ def _loaded(path: Path, config: Config) -> Policy:
 
 
 class OnnxFollower:
-    """An ONNX model with the inputs and outputs of `mjxball.export`, one row per flight."""
+    """An ONNX model with the inputs and outputs of `mjxball.export`, one row per flight and follower."""
 
     def __init__(self, name: str, session: Any):
         self.name, self._session = name, session
+        self.residual_on_pid = residual_on_pid(_metadata(name, session))
         self._remembers = "memory" in {one.name for one in session.get_inputs()}
         self._memory: np.ndarray | None = None
 
@@ -89,6 +126,18 @@ class OnnxFollower:
         return answered(self.name, command, rows).reshape(*np.shape(observation)[:-1], 3)
 
 
+def _metadata(name: str, session: Any) -> dict[str, Any]:
+    """Metadata of the policy that the model was exported from; {} for a model of another origin."""
+    text = session.get_modelmeta().custom_metadata_map.get("card", "{}")
+    try:
+        found = parse_json(text)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f"the metadata of {name} is not a JSON object")
+    return found
+
+
 def _session(path: Path) -> Any:
     try:
         import onnxruntime  # type: ignore[import-untyped]
@@ -99,6 +148,7 @@ def _session(path: Path) -> Any:
     try:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 4  # what it raises says it all
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # CPU time is that of the model alone
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # whatever the runtime raises for a file that is no model
         raise InputError(f"{path} is no ONNX model: {said(error)}") from None
@@ -120,22 +170,3 @@ def _session(path: Path) -> Any:
                 f"['flights', {width if isinstance(width, int) else 'a number'}], for any number of flights"
             )
     return session
-
-
-def checked(make: FollowerFactory, config: Config, calls: int = CALLS) -> Follower:
-    """`make(config)`, after `calls` for a flight at rest; InputError if they are too slow or return no command."""
-    follower, count = make(config), len(config.plant.followers)
-    shape = (1, OBSERVATION_SIZE) if count == 1 else (1, count, OBSERVATION_SIZE)
-    observation, taken = np.zeros(shape), deque[float](maxlen=CALLS)
-    follower.reset()
-    for _ in range(calls):
-        begun = time.perf_counter()
-        answered(follower.name, follower(observation), observation)
-        taken.append(time.perf_counter() - begun)
-        slow = [one for one in taken if one > MAX_CALL_TIME]
-        if len(slow) > CALLS // 2:
-            raise InputError(
-                f"follower {follower.name} takes {1e3 * min(slow):.0f} ms a call; at most {1e3 * MAX_CALL_TIME:.0f} ms"
-            )
-    follower.reset()
-    return follower

@@ -1,80 +1,100 @@
-"""When a flight succeeds beside references, and the summary of a track of mjxball-bench."""
+"""The one definition of success, and the summary of a track's flights.
+
+A flight succeeds if the object reaches its goal at most 25 % later than with the oracle, a controller that knows
+everything, and stays there, with no rotor at its limit for more than 5 % of the time. "There" is a radius about the
+goal, see `mjxball.bench.tracks`. A goal that moves must be followed within the radius from 3 s on.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
 from mjxball.evaluate.metrics import Metrics
 
-
-class Bound(NamedTuple):
-    """By how much a number may exceed that of the best reference: by the larger of both."""
-
-    absolute: float = 0.0  # in the unit of the number; of a peak [m] times the length of the plant
-    relative: float = 0.0  # share of the reference's number
-
-
-# A flight of mjxball-bench succeeds if it does not fail and is within these: peak [m], settling time [s], overshoot.
-BOUNDS = {"peak": Bound(0.003), "settling": Bound(0.1, 0.1), "overshoot": Bound(0.01)}
+LATER = 1.25  # largest arrival over that of the oracle
+MOVING_DEADLINE = 3.0  # from which on a goal that moves must be followed [s]
+MAX_ROTOR_SHARE = 0.05  # of the time at a limit, of any one rotor
+MAX_CPU_TIME = 0.020  # of the follower for one control step of one flight [s]
+SOONEST = 0.1  # of an oracle's arrival that another is compared with; it may be there from the start [s]
+ROUNDING = 1e-9  # of a time [s]
 CONFIDENCE = 0.95  # of the interval of the share of successes (Wilson 1927)
+# Why flights do not succeed. A crash has no other reason, and late and leaves exclude each other.
+REASONS = {
+    "crashed": "|e_o| beyond d_term, or a value that is not finite",
+    "late": "the object is within the radius for the first time after the deadline, or never",
+    "leaves": "it was there in time, but is beyond the radius after the deadline",
+    "rotors": f"a rotor is at its limit for more than {100 * MAX_ROTOR_SHARE:g} % of the time",
+    "slow": f"a control step of one flight takes more than {1e3 * MAX_CPU_TIME:g} ms of CPU time",
+}
 
 
-def numbers(metrics: Metrics) -> tuple[float, float, float]:
-    """(peak [m], settling time [s], overshoot) of a flight, infinite where it failed or never settled."""
-    if metrics.failed or not math.isfinite(metrics.peak):
-        return math.inf, math.inf, math.inf
-    settling = math.inf if metrics.settling_time is None else metrics.settling_time
-    return metrics.peak, settling, math.inf if metrics.overshoot is None else metrics.overshoot
+def deadline(oracle_arrival: float, moving: bool) -> float:
+    """When the object must have arrived for good [s], where with the oracle it arrives at `oracle_arrival` [s]."""
+    return MOVING_DEADLINE if moving else LATER * oracle_arrival + ROUNDING
 
 
-def limits(best: Mapping[str, Any], bounds: Mapping[str, Bound], length: Any = 1.0) -> dict[str, Any]:
-    """The largest numbers that succeed, for each name of `bounds`, where references have `best`; arrays or floats.
+def reasons(metrics: Metrics, deadline: float, cpu_time: float = 0.0) -> tuple[str, ...]:
+    """Keys of `REASONS` why a flight does not succeed; () if it does.
 
-    Infinite where no reference has a finite number. `length` of the plant, over that which the bounds are meant for.
+    `metrics` were measured with the flight's radius; `cpu_time` [s] is the follower's for a control step.
     """
-    most = {}
-    for name, bound in bounds.items():
-        absolute = bound.absolute * length if name == "peak" else bound.absolute
-        most[name] = best[name] + np.maximum(absolute, bound.relative * best[name] if bound.relative else 0.0)
-    return most
+    if metrics.failed:
+        return ("crashed",)
+    found = []
+    if metrics.reached is None or metrics.reached > deadline:
+        found.append("late")
+    elif metrics.arrival is None or metrics.arrival > deadline:
+        found.append("leaves")
+    if metrics.rotor_limit_share is None or metrics.rotor_limit_share > MAX_ROTOR_SHARE:
+        found.append("rotors")
+    if cpu_time > MAX_CPU_TIME:
+        found.append("slow")
+    return tuple(found)
 
 
-def bar(best: np.ndarray, length: float = 1.0) -> np.ndarray:
-    """(flights, 3): the largest `numbers` with which flights succeed where references have `best` (flights, 3)."""
-    return np.stack([*limits(dict(zip(BOUNDS, best.T, strict=True)), BOUNDS, length).values()], axis=1)
+def interval(succeeded: int, flights: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of the share of successes."""
+    found = binomtest(succeeded, flights).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
 
 
-def successes(flown: Sequence[Metrics], bars: np.ndarray) -> list[bool]:
-    """Whether each flight succeeds, of `bars` (flights, 3)."""
-    return [
-        not metrics.failed and bool((np.array(numbers(metrics)) <= most).all())
-        for metrics, most in zip(flown, bars, strict=True)
-    ]
+def summary(
+    flown: Sequence[Metrics], failures: Sequence[tuple[str, ...]], oracle_arrivals: Sequence[float]
+) -> dict[str, Any]:
+    """Results of a track in one condition: counts, and values that are None where they would be infinite.
 
-
-def summary(flown: Sequence[Metrics], succeeded: Sequence[bool]) -> dict[str, Any]:
-    """A track's numbers in one condition; None for what is infinite."""
-    peak, settling, _ = np.array([numbers(one) for one in flown]).T
-    interval = binomtest(sum(succeeded), len(succeeded)).proportion_ci(CONFIDENCE, method="wilson")
+    `failures` are the `reasons` of each flight, `oracle_arrivals` the times [s] at which the oracle arrives. Rotor and
+    command values are those of flights that did not crash.
+    """
     sound = [one for one in flown if not one.failed]
-    limit, change = (
-        [getattr(one, name) for one in sound if getattr(one, name) is not None]
-        for name in ("rotors_at_limit", "smoothness")
-    )
+    ratios = [
+        math.inf if one.failed or one.arrival is None else one.arrival / max(oracle, SOONEST)
+        for one, oracle in zip(flown, oracle_arrivals, strict=True)
+    ]
+    errors = [math.inf if one.failed or one.late_error is None else one.late_error for one in flown]
     found = {
-        "flights": len(flown),
-        "met": sum(succeeded) / len(succeeded),
-        "low": float(interval.low),
-        "high": float(interval.high),
-        "failed": sum(one.failed for one in flown) / len(flown),
-        "settling_50": float(np.quantile(settling, 0.5, method="higher")),
-        "peak_90": float(np.quantile(peak, 0.9, method="higher")),
-        "rotors_at_limit": float(np.mean(limit)) if limit else math.inf,
-        "command_change": float(np.median(change)) if change else math.inf,
+        # Median arrival over the oracle's; 90 % quantile of the largest errors after the deadline [m].
+        "arrival_ratio": _quantile(ratios, 0.5),
+        "late_error_90": _quantile(errors, 0.9),
+        # Median power over hover; mean share of the time of the rotor that is longest at a limit; median change [rad].
+        "rotor_power": _quantile([one.rotor_power for one in sound], 0.5),
+        "rotor_limit_share": float(np.mean([one.rotor_limit_share for one in sound])) if sound else math.inf,
+        "command_change": _quantile([one.smoothness for one in sound], 0.5),
     }
-    return {name: value if math.isfinite(value) else None for name, value in found.items()}
+    return {
+        "flights": len(flown),
+        "succeeded": sum(not one for one in failures),
+        "reasons": {name: sum(name in one for one in failures) for name in REASONS},
+        **{name: value if math.isfinite(value) else None for name, value in found.items()},
+    }
+
+
+def _quantile(values: Sequence[float | None], share: float) -> float:
+    """The smallest of `values` that at least `share` of them do not exceed; None counts as infinite."""
+    known = [math.inf if value is None else value for value in values]
+    return float(np.quantile(known, share, method="inverted_cdf")) if known else math.inf

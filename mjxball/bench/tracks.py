@@ -1,31 +1,32 @@
-"""The flights of mjxball-bench, version 1. Frozen: a changed value here makes another version.
+"""The tracks of mjxball-bench: plants, and how flights on them are sampled.
 
-A draw is the seed of all flights. The leaderboard uses draw 0; other draws are flights that nobody tuned to.
+A draw is the seed of all flights. The leaderboard uses draw 0; other draws are flights that nobody tuned to. Both
+conditions have flights of their own, so that no calm flight tells of a disturbed one.
 """
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from mjxball.bench import VERSION
+from mjxball.bench import CONDITIONS, VERSION
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.constants import trim_limit
-from mjxball.control.followers import Follower
-from mjxball.evaluate.metrics import Metrics, fly_and_measure
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude, largest_margin
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rigs import rig_config, sample_rigs, unpadded
+from mjxball.sim.rigs import RigTable, rig_config, sample_rigs, unpadded
 from mjxball.sim.scenario import CgPath, Scenario
 
-ENGINE = "newton-euler"
 SECONDS = 30.0  # of a flight
-FLIGHTS = 120  # of a track, undisturbed, and as many disturbed
+FLIGHTS = 120  # of a track in each condition
+RADIUS, CRAZYFLIE_RADIUS = 0.010, 0.020  # about the goal, calm [m]
+WORLD_RADIUS = 2.0  # radius in the condition world over that in calm
+RIG_LENGTH = 0.17  # length of a rig up to which the radius is as above [m]
 MARGIN = 0.15  # trim margin of every load, see `plant.trim`
 SPEEDS = (0.2, 3.1)  # of the CG [rad/s]
 AMPLITUDES = (0.02, 0.17)  # of the pair's CG [m]
@@ -35,31 +36,29 @@ LOADS = (0.5, 1.5)  # mass of a team's object over that of its plant
 DIRECTIONS = tuple((math.cos(angle), math.sin(angle)) for angle in np.pi * np.arange(8) / 8)
 RATIOS = (1.0, 1.5, 2.0)  # of both speeds of a path
 RIGS, EACH_RIG = (2, 3, 4, 5, 6), 3  # drones of a rig, flights of each rig
-RIG_LENGTH = 0.17  # length of the pair, to which criteria in metres refer [m]
 NOISE, DELAY, RIG_DELAY = 1.0, 0.04, 0.02  # level, [s], [s] of random rigs
 THRUST = (0.985, 1.015)  # factor on the Crazyflies' rotor forces
-CRAZYFLIE = {"noise": 0.5, "estimator_drift": 1.0, "delay": 0.03, "quantize": True}
-LQGS = ("lqg", "lqg-slow", "lqg-offset-free")  # references: classical followers that know the plant
-RIG_LQGS = ("lqg-known-rig", "lqg-slow-known-rig")  # references that know the rig
-Pair = tuple[Scenario, Scenario]  # undisturbed, disturbed
+CRAZYFLIE = Disturbance(noise=0.5, estimator_drift=1.0, delay=0.03, quantize=True)
+# A flight sampled with a generator for a condition; None: it cannot be trimmed.
+Sampler = Callable[[np.random.Generator, str], Scenario | None]
 
 
 @dataclass(frozen=True)
-class World:
-    """Flights on one plant, and the references that know the plant."""
+class PlantFlights:
+    """How flights on one plant are sampled.
+
+    `config` is what a follower knows: the nominal plant. What a flight's plant really is stands in its scenario.
+    """
 
     config: Config
-    scenarios: tuple[Pair, ...]
-    references: tuple[str, ...]  # see `mjxball.bench.references`
-    # Scenarios of the references where the entrant knows less: undisturbed, disturbed in turn.
-    reference_scenarios: tuple[Scenario, ...] = ()
-    length: float = 1.0  # factor on criteria in metres
+    sample: Sampler
+    count: int = FLIGHTS  # in each condition
+    radius: float = RADIUS  # in the condition calm [m]
+    moving: bool = False  # whether the goal moves all the time
 
-    def fly(self, followers: Sequence[Follower], scenarios: Sequence[Scenario]) -> list[list[Metrics]]:
-        """Metrics of every flight of every follower, in float64."""
-        _, found = fly_and_measure(self.config, [(follower, scenarios) for follower in followers], ENGINE)
-        count = len(scenarios)
-        return [found[first : first + count] for first in range(0, len(found), count)]
+    def radius_in(self, condition: str) -> float:
+        """Radius [m] about the goal within which a flight in `condition` must stay."""
+        return self.radius * (WORLD_RADIUS if condition == "world" else 1.0)
 
 
 @dataclass(frozen=True)
@@ -68,124 +67,127 @@ class Track:
 
     name: str
     title: str
-    worlds: Callable[[int], list[World]]  # of one draw
+    flights: Callable[[int], list[PlantFlights]]  # of one draw
 
 
-def _random(draw: int, track: int) -> np.random.Generator:
-    return np.random.default_rng([VERSION, track, draw])
+def candidate(track: str, draw: int, plant: int, condition: str, number: int, sample: Sampler) -> Scenario | None:
+    """Candidate `number` in a condition on one plant of a track: the same whatever other candidates are sampled."""
+    place = list(TRACKS).index(track), plant, CONDITIONS.index(condition)
+    return sample(np.random.default_rng([VERSION, draw, *place, number]), condition)
 
 
-def _goal(random: np.random.Generator, reach: float = 1.0) -> tuple[float, float, float]:
-    """0.3 to 1 times `reach` away along each axis, either way; overshoot is ill-defined for smaller distances."""
+def _goal(random: np.random.Generator, distance: float = 1.0) -> tuple[float, float, float]:
+    """0.3 to 1 times `distance` away along each axis, either way."""
     sides = random.choice([-1.0, 1.0], 3)
-    x, y, z = map(float, reach * sides * random.uniform(0.3, 1.0, 3))
+    x, y, z = map(float, distance * sides * random.uniform(0.3, 1.0, 3))
     return x, y, z
 
 
-def _both(scenario: Scenario, random: np.random.Generator, delay: float = DELAY) -> Pair:
-    disturbed = Disturbance(noise=NOISE, delay=delay, seed=int(random.integers(2**31)))
-    return scenario, replace(scenario, disturbance=disturbed)
+def _disturbance(condition: str, delay: float = DELAY) -> Disturbance:
+    return Disturbance(noise=NOISE, delay=delay) if condition == "world" else Disturbance()
 
 
-def _pair(draw: int, known: bool) -> list[World]:
-    config, random, scenarios = preset("paper"), _random(draw, 0 if known else 1), list[Pair]()
-    while len(scenarios) < FLIGHTS:
+def _pair(draw: int, known: bool) -> list[PlantFlights]:
+    config = preset("paper")
+
+    def sample(random: np.random.Generator, condition: str) -> Scenario | None:
         mass, amplitude = (float(random.uniform(*most)) for most in (MASSES, AMPLITUDES))
-        scenario = Scenario(
+        believed = mass if known else BELIEVED
+        if amplitude > trim_limit(config.plant, mass, MARGIN, believed):
+            return None
+        return Scenario(
             omega=float(random.uniform(*SPEEDS)),
             amplitude=amplitude,
             mass=mass,
+            believed_mass=believed,
             phase=float(random.uniform(0, 2 * math.pi)),
             goal=_goal(random),
             seconds=SECONDS,
+            disturbance=_disturbance(condition),
         )
-        if amplitude <= trim_limit(config.plant, mass, MARGIN, mass if known else BELIEVED):
-            scenarios.append(_both(scenario, random))
-    if known:
-        return [World(config, tuple(scenarios), LQGS)]
-    blind = tuple(
-        (replace(calm, believed_mass=BELIEVED), replace(rough, believed_mass=BELIEVED)) for calm, rough in scenarios
+
+    return [PlantFlights(config, sample)]
+
+
+def _team(draw: int) -> list[PlantFlights]:
+    base = with_plant(preset("paper"), "team6")
+    configs = [ring_config(base, size) for size in TEAMS]
+    return [PlantFlights(config, partial(_sample_team, config), FLIGHTS // len(TEAMS)) for config in configs]
+
+
+def _sample_team(config: Config, random: np.random.Generator, condition: str) -> Scenario | None:
+    mass = config.plant.object_mass * float(random.uniform(*LOADS))
+    most = min(largest_amplitude(config, mass, MARGIN, way) for way in DIRECTIONS)
+    if most <= 0:
+        return None
+    width = float(random.uniform(0, 1))
+    path = CgPath(
+        direction=float(random.uniform(0, 2 * math.pi)),
+        width=width,
+        ratio=float(random.choice(RATIOS)),
+        lead=float(random.uniform(0, 2 * math.pi)),
     )
-    return [World(config, blind, LQGS, tuple(one for pair in scenarios for one in pair))]
+    return Scenario(
+        omega=float(random.uniform(*SPEEDS)),
+        amplitude=float(random.uniform(0, 1)) * min(most, cg_limit(config.plant)) / math.hypot(1, width),
+        mass=mass,
+        phase=float(random.uniform(0, 2 * math.pi)),
+        path=path,
+        goal=_goal(random),
+        seconds=SECONDS,
+        disturbance=_disturbance(condition),
+    )
 
 
-def _team(draw: int) -> list[World]:
-    worlds, random, base = [], _random(draw, 2), with_plant(preset("paper"), "team6")
-    for size in TEAMS:
-        config, scenarios = ring_config(base, size), list[Pair]()
-        widest = cg_limit(config.plant)
-        while len(scenarios) < FLIGHTS // len(TEAMS):
-            mass = config.plant.object_mass * float(random.uniform(*LOADS))
-            reach = min(largest_amplitude(config, mass, MARGIN, way) for way in DIRECTIONS)
-            width = float(random.uniform(0, 1))
-            path = CgPath(
-                direction=float(random.uniform(0, 2 * math.pi)),
-                width=width,
-                ratio=float(random.choice(RATIOS)),
-                lead=float(random.uniform(0, 2 * math.pi)),
-            )
-            scenario = Scenario(
-                omega=float(random.uniform(*SPEEDS)),
-                amplitude=float(random.uniform(0, 1)) * min(reach, widest) / math.hypot(1, width),
-                mass=mass,
-                phase=float(random.uniform(0, 2 * math.pi)),
-                path=path,
-                goal=_goal(random),
-                seconds=SECONDS,
-            )
-            if reach > 0:
-                scenarios.append(_both(scenario, random))
-        worlds.append(World(config, tuple(scenarios), LQGS))
-    return worlds
-
-
-def _rigs(draw: int) -> list[World]:
-    worlds, random, base = [], _random(draw, 3), preset("universal")
+def _rigs(draw: int) -> list[PlantFlights]:
+    found, base = [], preset("universal")
     each = FLIGHTS // (EACH_RIG * len(RIGS))  # rigs of a size
     for size in RIGS:
         rigs = unpadded(sample_rigs(base, size, each, 1000 + draw).rigs, size)
         for row in range(each):
+            radius = RADIUS * max(1.0, float(rigs.length[row]) / RIG_LENGTH)
             config = rig_config(base, rigs, row)
-            scenarios = []
-            for _ in range(EACH_RIG):
-                path = CgPath(float(random.uniform(0, 2 * math.pi)), float(random.uniform(0, 1)), 1.0, math.pi / 2)
-                scenario = Scenario(
-                    omega=float(random.uniform(*SPEEDS)),
-                    amplitude=float(random.uniform(0, rigs.reach[row])),
-                    mass=float(rigs.object_mass[row]),
-                    believed_mass=float(rigs.believed_mass[row]),
-                    thrust=tuple(map(float, rigs.thrust[row])),
-                    phase=float(random.uniform(0, 2 * math.pi)),
-                    path=path,
-                    goal=_goal(random),
-                    seconds=SECONDS,
-                )
-                scenarios.append(_both(scenario, random, RIG_DELAY))
-            length = max(1.0, float(rigs.length[row]) / RIG_LENGTH)
-            worlds.append(World(config, tuple(scenarios), RIG_LQGS, length=length))
-    return worlds
+            found.append(PlantFlights(config, partial(_sample_rig, rigs, row), EACH_RIG, radius))
+    return found
 
 
-def _crazyflie(draw: int) -> list[World]:
-    config, random, scenarios = preset("flight"), _random(draw, 4), list[Pair]()
+def _sample_rig(rigs: RigTable, row: int, random: np.random.Generator, condition: str) -> Scenario:
+    path = CgPath(float(random.uniform(0, 2 * math.pi)), float(random.uniform(0, 1)), 1.0, math.pi / 2)
+    return Scenario(
+        omega=float(random.uniform(*SPEEDS)),
+        amplitude=float(random.uniform(0, rigs.reach[row])),
+        mass=float(rigs.object_mass[row]),
+        believed_mass=float(rigs.believed_mass[row]),
+        thrust=tuple(map(float, rigs.thrust[row])),
+        phase=float(random.uniform(0, 2 * math.pi)),
+        path=path,
+        goal=_goal(random),
+        seconds=SECONDS,
+        disturbance=_disturbance(condition, RIG_DELAY),
+    )
+
+
+def _crazyflie(draw: int) -> list[PlantFlights]:
+    config = preset("flight")
+    return [PlantFlights(config, partial(_sample_crazyflie, config), radius=CRAZYFLIE_RADIUS)]
+
+
+def _sample_crazyflie(config: Config, random: np.random.Generator, condition: str) -> Scenario | None:
     ranges = config.scenario
-    while len(scenarios) < FLIGHTS:
-        scenario = Scenario(
-            omega=float(random.uniform(*ranges.cg_speed)),
-            amplitude=float(random.uniform(*ranges.cg_amplitude)),
-            mass=float(random.uniform(*ranges.object_mass)),
-            believed_mass=config.plant.object_mass,
-            phase=float(random.uniform(0, 2 * math.pi)),
-            goal=_goal(random, ranges.goal_range),
-            thrust=tuple(map(float, random.uniform(*THRUST, 2))),
-            seconds=SECONDS,
-        )
-        rough = Disturbance(**CRAZYFLIE, seed=int(random.integers(2**31)))  # type: ignore[arg-type]
-        known = scenario.believed_mass, (), False, scenario.thrust
-        trims = [largest_margin(config, scenario.mass, side * scenario.amplitude, *known) for side in (-1, 1)]
-        if min(trim.margin for trim in trims) >= MARGIN:
-            scenarios.append((scenario, replace(scenario, disturbance=rough)))
-    return [World(config, tuple(scenarios), LQGS[:1])]
+    scenario = Scenario(
+        omega=float(random.uniform(*ranges.cg_speed)),
+        amplitude=float(random.uniform(*ranges.cg_amplitude)),
+        mass=float(random.uniform(*ranges.object_mass)),
+        believed_mass=config.plant.object_mass,
+        phase=float(random.uniform(0, 2 * math.pi)),
+        goal=_goal(random, ranges.goal_range),
+        thrust=tuple(map(float, random.uniform(*THRUST, 2))),
+        seconds=SECONDS,
+        disturbance=CRAZYFLIE if condition == "world" else Disturbance(),
+    )
+    known = scenario.believed_mass, (), False, scenario.thrust
+    trims = [largest_margin(config, scenario.mass, side * scenario.amplitude, *known) for side in (-1, 1)]
+    return scenario if min(trim.margin for trim in trims) >= MARGIN else None
 
 
 TRACKS: dict[str, Track] = {
@@ -198,9 +200,3 @@ TRACKS: dict[str, Track] = {
         Track("crazyflie", "two Crazyflies", _crazyflie),
     )
 }
-
-
-@functools.cache
-def worlds_of(track: str, draw: int) -> list[World]:
-    """The worlds of a track for one draw; cached."""
-    return TRACKS[track].worlds(draw)

@@ -20,18 +20,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tracks", nargs="+", choices=TRACKS, default=list(TRACKS), metavar="NAME", help=about)
     about = "other flights than the published ones (default 0)"
     parser.add_argument("--draw", type=int, default=0, metavar="N", help=about)
+    about = "repeat the evaluation of the entry with this key: noise and order of flights (default a fresh one)"
+    parser.add_argument("--key", metavar="HEX", help=about)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json", help="where to write the entry")
+    about = "write a table of all flights too: goal, arrival, the oracle's, errors, why a flight did not succeed"
+    parser.add_argument("--flights", type=Path, metavar="FILE.csv", help=about)
 
 
 def run(options: argparse.Namespace, command: str) -> int:
     """Fly the tracks and write the entry; return the exit code."""
-    from mjxball.bench.entry import make_entry, table
-    from mjxball.bench.followers import entrant
+    from mjxball.bench.entry import flight_table, make_entry, table
 
     cli.output_file(options.out, ".json")
-    name, make = entrant(options.follower)
-    entry = make_entry(name, make, options.tracks, options.draw, clock())
+    if options.flights is not None:
+        cli.output_file(options.flights, ".csv")
+    entry, flown = make_entry(options.follower, options.tracks, options.draw, options.key, clock())
     origin = {"command": command, "commit": commit(), "versions": versions()}
     write_atomically(options.out, json.dumps({**entry, **origin}, indent=1, allow_nan=False) + "\n")
+    if options.flights is not None:
+        write_atomically(options.flights, flight_table(flown))
     print(f"{table(entry)}\nthe entry is {options.out}")
     return 0
