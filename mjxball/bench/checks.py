@@ -34,8 +34,9 @@ FORMS = {
 FIRST_DATE = datetime.date(2026, 11, 29)  # of this version
 ROUNDING = 1e-7  # of a ratio or a mean, relative
 QUICKEST = 0.1  # arrival over the oracle's that no follower is below in the median
-# Mean power over that of hover: a load may be lighter than believed, and no rotor gives four times what hovers.
-POWER = (0.8, 8.0)
+# Median power over that of hover. A load may be lighter than believed, and the ground may carry; no rotor gives four
+# times what hovers.
+POWER = (0.7, 8.0)
 MAX_CHANGE = 2 * Command().tilt_limit  # of a command from step to step [rad]
 MAX_ERROR = 10.0  # of a flight that does not crash [m]
 
