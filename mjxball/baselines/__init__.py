@@ -23,7 +23,6 @@ from mjxball.errors import InputError
 __all__ = [
     "BASELINES",
     "CONTROLLERS",
-    "SUITE_BASELINES",
     "Adaptive",
     "Copy",
     "CrazyflieLqg",
@@ -58,10 +57,8 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "mpc": Mpc,
     "lqg-known-failures": KnownFailuresLqg,
 }
-# In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
-SUITE_BASELINES = tuple(name for name in CONTROLLERS if name not in ("lqg-known-failures", "mpc"))
-VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
-BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
+VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc", "lqg-known-failures")
+BASELINES = tuple(name for name in CONTROLLERS if name not in VARIANTS)  # default followers of `eval.py`
 
 
 def make_controller(name: str, config: Config) -> Controller:

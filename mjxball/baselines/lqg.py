@@ -22,7 +22,7 @@ from mjxball.plant import plant_parameters
 CORRECTION_LIMIT = 0.6  # of each follower's roll and pitch against the load's torque [rad]
 LIMITS = (1.0, 0.6)  # of a command about an axis with a load torque and about another [rad]
 # QUICK reproduces an independent simulation; with delayed commands it limit-cycles. SLOW settles earliest under noise
-# and 40 ms of delay among those that settle in every case (docs/archive/training.md).
+# and 40 ms of delay among those that settle in every flight.
 QUICK = Tuning(position=0.25, velocity=1.0, height=0.25, climb=1.0, torque_walk=9.0, tilt_limit=0.25)
 SLOW = Tuning(position=0.15, velocity=0.6, height=0.15, climb=0.6, torque_walk=0.003)
 OFFSET_FREE = Tuning(position=0.2, velocity=0.6, height=0.2, climb=0.6, torque_walk=0.003, lift_walk=0.01)

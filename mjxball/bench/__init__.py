@@ -1,8 +1,7 @@
 """mjxball-bench: the same flights for every follower, compared with classical followers that know the plant.
 
 `tracks` has the flights, `followers` loads followers, `references` has classical results, `success` the criterion,
-`entry` the result file; docs/leaderboard.py tabulates entries. Flights and criterion of a version never change. Besides
-the benchmark: `suites` of single difficulties, `scores` of followers on them, `report`.
+`entry` the result file; docs/leaderboard.py tabulates entries. Flights and criterion of a version never change.
 """
 
 NAME, VERSION = "mjxball-bench", 1
