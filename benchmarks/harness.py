@@ -57,12 +57,6 @@ def table(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = (), form: 
         print("  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip(), flush=True)
 
 
-def spread(values: Iterable[float]) -> str:
-    """Least - median - most."""
-    found = sorted(values)
-    return " - ".join(f"{value:.4g}" for value in (found[0], statistics.median(found), found[-1]))
-
-
 def medians(rows: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, float]:
     """Of every one of `names` the median over paired runs; a number that is missing is infinitely bad."""
     known = {name: [math.inf if row[name] is None else row[name] for row in rows] for name in names}

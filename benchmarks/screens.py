@@ -48,7 +48,6 @@ PROGRAMS = {  # name: arguments of Python, in a folder of its own
     "view-help": (*VIEW, "--help"),
     "train": TRAIN,
     "eval": ("eval.py", "balance", *ENGINE, "--seconds", "10"),
-    "suite": ("eval.py", "suites", "--only", "cg-speed", "--followers", "copy", "lqg", *ENGINE, "--num-seeds", "1"),
     "fly": FLY,
     "fly-fault": (*FLY, *FAULT),
     "refused": ("eval.py", "nothing.npz"),

@@ -79,38 +79,21 @@ def linearised_hovers(
     config: Config, controller: Controller, cases: Sequence[tuple[float, float, float]], delay: int = 0
 ) -> list[Hover]:
     """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
-    return linearised(config, lambda _: controller, np.zeros(1), cases, delay)[0]
-
-
-def linearised(
-    config: Config,
-    controller: Callable[[Any], Controller],
-    numbers: Any,
-    cases: Sequence[tuple[float, float, float]],
-    delay: int,
-) -> list[list[Hover]]:
-    """`linearised_hovers` of every one of k controllers, `controller` of traced numbers: a tree of arrays (k, ...)."""
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         scenarios = [
             Scenario(omega=0.0, phase=np.pi / 2, amplitude=offset, mass=mass, believed_mass=believed)
             for offset, mass, believed in cases
         ]
         loads = jax.tree.map(jnp.asarray, rollout.load_of(config, scenarios))
-
-        def of_one(own: Any) -> tuple[Array, Array, Array, Array]:
-            start, step = closed_loop(config, controller(own), delay)
-            return jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load)))(loads)
-
-        found = map(np.asarray, jax.jit(jax.vmap(of_one))(jax.tree.map(jnp.asarray, numbers)))
+        start, step = closed_loop(config, controller, delay)
+        each = jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load)))
+        found = map(np.asarray, jax.jit(each)(loads))
     return [
-        [
-            Hover(
-                *(offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4]))),
-                *(_radius(jacobian), float(swing)),
-            )
-            for (offset, mass, _), z, left, jacobian, swing in zip(cases, *one, strict=True)
-        ]
-        for one in zip(*found, strict=True)
+        Hover(
+            *(offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4]))),
+            *(_radius(jacobian), float(swing)),
+        )
+        for (offset, mass, _), z, left, jacobian, swing in zip(cases, *found, strict=True)
     ]
 
 

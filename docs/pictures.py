@@ -163,7 +163,7 @@ def tutorial(out: Path) -> None:
         first = place / "runs" / "first"
         plot_training(first, configs.preset("transport"), out / "tutorial-training.svg")
         flights(["copy", first / "policy.npz"], REFERENCE, out / "tutorial-flight.svg")
-        screenshot(place / "benchmark" / "report.html", out / "tutorial-report.png")
+        screenshot(place / "report" / "report.html", out / "tutorial-report.png")
         screenshot(place / "first.html", out / "tutorial-viewer.png")
         flown = read_recording(place / "first.jsonl")
         log = without_goal(result_of(flown, "first, flown"), flown.guided_rows)

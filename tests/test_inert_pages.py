@@ -14,12 +14,12 @@ from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
 from mjxball.baselines import make_baseline
-from mjxball.bench import report as report_page
-from mjxball.bench import suites
-from mjxball.bench.report import write_report
-from mjxball.bench.scores import fly_suites
 from mjxball.config import preset
+from mjxball.evaluate import report as report_page
+from mjxball.evaluate.report import write_report
+from mjxball.evaluate.results import fly_scenarios
 from mjxball.policy import Policy, load_file, shipped_policy
+from mjxball.sim.scenario import Scenario
 from mjxball.view.page import flight_page, page_contents
 from mjxfly.flight_log import Journal
 from mjxfly.limits import FlightSettings
@@ -41,31 +41,31 @@ def elements(tab: Any) -> dict[str, int]:
 
 @pytest.mark.slow
 def test_a_report_of_a_follower_with_a_hostile_name(browser: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    """Also in its metadata, in the command, in suites and variants, and in the figures."""
+    """Also in its metadata, in the command, in titles of scenarios, and in the figures."""
     monkeypatch.setattr(report_page, "film", lambda *_: (None, TEXT))
-    config, suite = preset("paper"), suites.BY_NAME["delay"]
-    variant = suite.variants[0]
-    pages = {}
-    short = dataclasses.replace(variant, scenario=dataclasses.replace(variant.scenario, seconds=24.0))
-    flown = fly_suites(
-        config, [make_baseline("copy", config)], [dataclasses.replace(suite, variants=(short,))], 1, "newton-euler"
-    )
+    config, pages = preset("paper"), {}
+    scenarios = [Scenario(omega=omega, seconds=24.0) for omega in (0.31, 1.0)]
+    flown = fly_scenarios(config, [make_baseline("copy", config)], scenarios, "newton-euler")
     for label, text in (("plain", "plain"), ("hostile", TEXT)):
-        cut, metadata = dataclasses.replace(short, label=text), load_file(shipped_policy("paper"))
-        own = dataclasses.replace(suite, name=text, about=text, axis=text, variants=(cut, cut))
-        scores = [dataclasses.replace(score, follower=text, suite=text, variant=text) for score in flown]
-        policy = Policy(dataclasses.replace(metadata, metadata={**metadata.metadata, "preset": text, text: text}), text)
-        write_report(tmp_path / label, config.plant, scores, [own], [policy], f"eval.py {text}", {text: text})
+        monkeypatch.setattr(report_page, "scenario_title", lambda _, text=text: text)
+        results, contents = (
+            [dataclasses.replace(one, follower=text) for one in flown],
+            load_file(shipped_policy("paper")),
+        )
+        policy = Policy(dataclasses.replace(contents, metadata={**contents.metadata, "preset": text, text: text}), text)
+        write_report(tmp_path / label, config.plant, results, [policy], f"eval.py {text}", {text: text})
         tab = pages[label] = opened(browser, tmp_path / label / "report.html", 1280)
-        assert tab.title() == "Suites of scenarios"
+        assert tab.title() == "Flights of followers"
     plain, hostile = pages["plain"], pages["hostile"]
     assert elements(plain) == elements(hostile)
-    assert hostile.inner_text("#verdict-table td >> nth=0") == TEXT
-    assert hostile.inner_text("details summary b >> nth=-1") == TEXT
+    assert hostile.inner_text("#table tbody tr:nth-child(1) td:nth-child(2)") == TEXT
+    assert hostile.inner_text("#table tbody tr:nth-child(2) td:nth-child(1)") == TEXT
+    assert hostile.inner_text("details summary >> nth=0") == TEXT
     assert json.dumps(TEXT)[1:-1] in hostile.locator("details pre").last.text_content()
     assert hostile.locator("svg text", has_text=TEXT).count() == plain.locator("svg text", has_text="plain").count() > 0
     hostile.select_option("#follower", TEXT)  # the page's own script still runs
-    assert hostile.locator("#scores tbody tr:visible").count() == plain.locator("#scores tbody tr").count()
+    hostile.select_option("#scenario", TEXT)
+    assert hostile.locator("#table tbody tr:visible").count() == len(flown)
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def parts() -> set[str]:
     """What pages are made of, the plants that have a name, and the C of the apps on board."""
-    places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "bench/templates", "config/plants"))
+    places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "evaluate/templates", "config/plants"))
     paths = [path for place in places for path in place.iterdir()]
     paths += (path for path in (REPOSITORY / "mjxfly").rglob("*.[chj]*") if path.suffix in (".c", ".h", ".js"))
     return {str(path.relative_to(REPOSITORY)) for path in paths}

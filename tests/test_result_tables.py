@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
 from command_line import REPOSITORY
 from tables import rows
 
@@ -23,27 +22,8 @@ def one(found: list[dict[str, Any]], **given: Any) -> dict[str, Any]:
     return row
 
 
-def cells() -> Iterator[tuple[str, Numbers]]:
-    found = measured("balance_cells")["summaries"]
-    wheres = [f"mass known, {kind}" for kind in ("undisturbed", "noise and 40 ms")]
-    wheres += [f"mass unknown, {kind}, trimmed by the follower alone" for kind in ("undisturbed", "noise and 40 ms")]
-    for name in ("balance", "sac", "mpc", "lqg-slow", "pid", "observer", "lqg-offset-free", "copy"):
-        own = [one(found, where=where, policy=name) for where in wheres]
-        yield name, [number for row in own for number in (row["all four"], 1e3 * row["median peaks"]["policy"])]
-
-
-def levels() -> Iterator[tuple[str, Numbers]]:
-    own = one(measured("balance_seeds")["rows"], policy="seed1.npz")
-    for row, name in (("[peak]", "peak"), ("RMSE", "rmse"), ("smallest settling", "settling_time")):
-        yield row, [own["reached"][name], len(own["levels"])]
-    yield "beyond trim", [number for pair in own["beyond trim"] for number in pair]
-    for row, suite, level in (("peak at twice", "noise", "2"), ("peak in gusts", "gusts", "0.6 N")):
-        yield row, [1e3 * one(own["levels"], suite=suite, level=level)["peak"]]
-
-
 def seeds() -> Iterator[tuple[str, Numbers]]:
     found = measured("balance_seeds")["rows"]
-    yield "successes", np.min([row["cells"] for row in found], axis=0).tolist()
     flights = [flown for row in found for flown in row["flights"]]
     yield "failed", [max(flown["failed"] for flown in flights)]
     yield "99 % of", [1e3 * max(flown["99 %"] for flown in flights)]
@@ -160,8 +140,6 @@ def onboard() -> Iterator[tuple[str, Numbers]]:
 
 
 SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
-    "Against classical followers": ("results", cells),
-    "Benchmark": ("results", levels),
     "All seeds": ("results", seeds),
     "Stability": ("results", stability),
     "Teams": ("results", teams),

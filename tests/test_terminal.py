@@ -14,9 +14,6 @@ from command_line import REPOSITORY, environment, script, tiny
 from pseudo_terminal import on_terminal
 
 from mjxball import terminal
-from mjxball.bench.scores import Score, text_table
-from mjxball.bench.suites import BY_NAME
-from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.results import metric_text
 from mjxball.terminal import fitted, folded, table
 
@@ -112,32 +109,6 @@ def test_parts_that_do_not_fit_are_left_out() -> None:
 # --- tables ---------------------------------------------------------------------------------------------------------
 
 
-def flight(**values: float | bool | None) -> Metrics:
-    return Metrics(**{**dict.fromkeys(Metrics.__dataclass_fields__, 0.5), "failed": False, **values})
-
-
-def test_suites_have_units_never_and_a_mark() -> None:
-    suites = [BY_NAME["cg-speed"], BY_NAME["rotor-lag"]]
-    flown = {"settled": flight(), "never": flight(settling_time=None), "lost": flight(failed=True)}
-    scores = [
-        Score(suite.name, variant.label, name, (metrics,), None)
-        for suite in suites
-        for variant in suite.variants[:2]
-        for name, metrics in flown.items()
-    ]
-    lines = text_table(scores, suites).splitlines()
-    assert "inf" not in "".join(lines)
-    assert "nan" not in "".join(lines)
-    assert lines[0].split()[:4] == ["peak", "rmse", "settle", "over"]
-    assert lines[1].split()[:8] == ["suite", "variant", "follower", "failed", "m", "m", "s", "%"]
-    marked = [line.split()[1:4] for line in lines if line.startswith("* ")]
-    assert marked == [["cg-speed", "0.31", "rad/s"]] * 3  # the lag of 15 ms is another plant
-    assert "0.50" in lines[2]
-    assert "never" in lines[3]
-    assert "0.8660" in lines[3]
-    assert lines[4].split()[5:8] == ["1/1", "failed", "failed"]
-
-
 def test_numbers_of_a_table() -> None:
     assert [metric_text("settling_time", value) for value in (None, np.inf, 2.0)] == ["never", "never", "2.00"]
     assert [metric_text("overshoot", value) for value in (None, np.nan, np.inf, 0.125)] == ["-", "-", "failed", "12.5"]
@@ -145,8 +116,8 @@ def test_numbers_of_a_table() -> None:
 
 TABLE = """
 from mjxball.terminal import table
-rows = [["*", "cg-speed", "+0.1 kg at 12 s, -0.1 kg at 24 s", name, *["0.1234"] * 9] for name in ("a", "a_follower")]
-print(table(["", "suite", "variant", "follower", *[f"value{k}\\nm" for k in range(9)]], rows, (1, 2, 3), 3))
+rows = [["*", "waveform", "+0.1 kg at 12 s, -0.1 kg at 24 s", name, *["0.1234"] * 9] for name in ("a", "a_follower")]
+print(table(["", "kind", "scenario", "follower", *[f"value{k}\\nm" for k in range(9)]], rows, (1, 2, 3), 3))
 """
 
 
@@ -161,7 +132,7 @@ def test_a_table_fits(columns: int, tmp_path: Path) -> None:
     assert [one for one in values if one in shown] == values[:fitting]
     assert left_out == ", ".join(values[fitting:])
     assert shown.count("0.1234") == 2 * fitting
-    assert [shown.count(word) for word in ("a_follower", "cg-speed")] == [1, 1 if columns == 100 else 2]
+    assert [shown.count(word) for word in ("a_follower", "waveform")] == [1, 1 if columns == 100 else 2]
 
 
 def test_a_table_in_a_file_has_a_line_a_row() -> None:

@@ -39,7 +39,7 @@ from mjxfly.twin.conditions import Battery  # noqa: E402
 from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
 
 MODULES = (  # known by their last name
-    *("cells", "horizon", "rigs", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
+    *("horizon", "rigs", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
     *(
         "mjxball.control.network_interface",
         "mjxball.control.motors",
@@ -98,12 +98,6 @@ def rounding(pivot: bool) -> float:
     """Largest relative difference between the engines' accelerations, on the pivot or elsewhere."""
     own = [row for row in results("engines")["rows"] if (row["stand"] == "pivot") is pivot]
     return max(row[name] for row in own for name in row if "form" in name or "MJX" in name)
-
-
-def best(suite: str, level: str) -> dict[str, Any]:
-    """What the best follower other than `balance` reaches on a level of the benchmark."""
-    (row,) = (row for row in results("balance")["levels"] if (row["suite"], row["level"]) == (suite, level))
-    return row
 
 
 ten_minutes = {

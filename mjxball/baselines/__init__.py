@@ -24,7 +24,6 @@ from mjxball.errors import InputError
 __all__ = [
     "BASELINES",
     "CONTROLLERS",
-    "SUITE_BASELINES",
     "Adaptive",
     "Copy",
     "CrazyflieLqg",
@@ -51,10 +50,8 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "lqg": lambda config: _of_kind(config, Lqg, CrazyflieLqg),
     "mpc": Mpc,
 }
-# In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
-SUITE_BASELINES = tuple(name for name in CONTROLLERS if name not in ("lqg-known-failures", "mpc"))
-VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
-BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
+VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc", "lqg-known-failures")
+BASELINES = tuple(name for name in CONTROLLERS if name not in VARIANTS)  # default followers of `eval.py`
 
 
 def _of_kind(

@@ -160,7 +160,7 @@ class Oracle:
             flat = error[..., :2] - place / mass
             return [flat, error[..., 2:] + (_turning(moment) * angles).sum(axis=-1)[..., None] / mass]
 
-        wind = xp.zeros_like(seen[..., :3]) if known.force is None else known.force / mass
+        wind = xp.zeros_like(seen[..., :3]) if known.force is None else model.in_body_axes(known.force) / mass
         parts = [
             *of_cg(seen[..., ERROR], tilt, places[0]),
             *of_cg(seen[..., ERROR_RATE], rates, places[1]),

@@ -1,9 +1,9 @@
 """mjxball-bench: the same flights for every follower, compared with a controller that knows everything.
 
-`tracks` samples flights, `draw` selects those that the oracle succeeds in and stores them (`store`), `process` runs a
-follower in a process of its own (`child`), `evaluation` flies it, `success` is the criterion, `entry` the result file
-and `reading` its checks; docs/leaderboard.py tabulates entries. Flights and criterion of a version never change.
-Besides the benchmark: `suites` of single difficulties, `scores` of followers on them, `report`.
+`tracks` samples flights in two `conditions`, `draw` selects those that the oracle succeeds in and stores them
+(`store`), `process` runs a follower in a process of its own (`child`), `evaluation` flies it, `success` is the
+criterion, `entry` the result file and `checks` what it must satisfy; docs/leaderboard.py tabulates entries. Flights and
+criterion of a version never change.
 """
 
 NAME, VERSION = "mjxball-bench", 2

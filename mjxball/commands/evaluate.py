@@ -6,9 +6,9 @@ import shlex
 import sys
 
 from mjxball import cli, running
-from mjxball.commands import bench, figures, fly, suites
+from mjxball.commands import bench, figures, fly
 
-COMMANDS = {"fly": fly, "suites": suites, "bench": bench, "figures": figures}
+COMMANDS = {"fly": fly, "bench": bench, "figures": figures}
 WHOLE = ("-h", "--help", "--version", "--print-completion")  # flags of the program, not of a command
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from mjxball import cli
 from mjxball.baselines import CONTROLLERS
-from mjxball.bench.report import MADE, write_page
 from mjxball.commands.followers import add_flight, add_policies, clock, load, refuse_same_names
 from mjxball.config import Config, preset
 from mjxball.evaluate import paper_figures
 from mjxball.evaluate.policies import native_config
+from mjxball.evaluate.report import MADE, write_page
 from mjxball.evaluate.stand_figure import stand_config
 from mjxball.files import write_atomically
 from mjxball.plotting import STYLES

@@ -11,13 +11,12 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.baselines import BASELINES
-from mjxball.bench.report import write_report
-from mjxball.bench.scores import scores_of
 from mjxball.commands.followers import Named, add_flight, add_followers, add_policies, load, named, refuse_same_names
 from mjxball.commands.scenarios import native_scenarios, scenarios_of, setup_of
 from mjxball.errors import InputError
 from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant
+from mjxball.evaluate.report import write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
 from mjxball.evaluate.scenarios import rig_summary, standard_scenarios
 from mjxball.files import write_atomically
@@ -128,8 +127,7 @@ def run(options: argparse.Namespace, command: str) -> int:
         if options.out:
             place = options.out / group.setup.preset if number else options.out
             write_results(results, place, options.style)
-            scores, suites = scores_of(results)
-            write_report(place, group.setup.plant, scores, suites, policies, command, versions())
+            write_report(place, group.setup.plant, results, policies, command, versions())
             print(f"report.html, figures and cells.json are in {place}")
         if options.check:
             code = max(code, _check(group.setup, policies, results, options.physics))

@@ -45,16 +45,6 @@ class PrivilegedInfo(NamedTuple):
         """The same for a follower without `needs_privileged`, so that one which wrongly says so learns nothing."""
         return self.of_believed(self.believed_mass)
 
-    @classmethod
-    def of_believed(cls, believed_mass: Array) -> PrivilegedInfo:
-        """What any follower may read: `believed_mass` (...), and zeros instead of the rest."""
-        zero = 0.0 * believed_mass
-        return cls(believed_mass, zero, zero, zero)
-
-    def without_truth(self) -> PrivilegedInfo:
-        """The same for a follower without `needs_privileged`, so that one which wrongly says so learns nothing."""
-        return self.of_believed(self.believed_mass)
-
 
 class Controller(Protocol):
     """A follower's controller as two pure functions of arrays; `state` is a tuple of arrays (possibly empty)."""

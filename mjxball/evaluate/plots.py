@@ -54,7 +54,14 @@ def distance(flight: Trajectory) -> np.ndarray:
 def plot_flights(
     results: Sequence[Result], title: str, path: Path, panels: Sequence[tuple[str, int | None, str]] = PANELS
 ) -> None:
-    """Plot the flights of all followers in one scenario over time, one panel of `PANELS` below the other.
+    """Write the figure of `draw_flights` to `path`."""
+    save(draw_flights(results, title, panels), path)
+
+
+def draw_flights(
+    results: Sequence[Result], title: str | None, panels: Sequence[tuple[str, int | None, str]] = PANELS
+) -> Any:
+    """Figure of the flights of all followers in one scenario over time, one panel of `PANELS` below the other.
 
     Position with the goal dotted, distance, CG offset (y dotted), commands (the leader's thin). A panel or curve
     without a finite value is left out.
@@ -71,7 +78,7 @@ def plot_flights(
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     legend_above(figure, axes, 4 if wide > 5 else 3, title)
-    save(figure, path)
+    return figure
 
 
 def _is_known(values: np.ndarray) -> bool:

@@ -20,7 +20,7 @@ from mjxball.sim.scenario import Scenario, of_plant
 from mjxball.sim.trajectory import Trajectory
 
 RESULTS = "cells.json"  # in the output directory
-# The metrics in `--json`, a fixed format; a benchmark's scores have all of them.
+# The metrics in `--json`, a fixed format.
 JSON_METRICS = (
     *("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "plane_peak"),
     *("max_tilt", "action_error", "failed", "rotors_at_limit", "rotor_power", "command_spread"),
@@ -83,6 +83,8 @@ COLUMNS = {
     "plane_peak": ("plane\nm", 1.0, 4),
     "max_tilt": ("tilt\ndeg", 180 / math.pi, 1),
     "action_error": ("act.err\n", 1.0, 3),
+    "effort": ("effort\nN", 1.0, 3),
+    "smoothness": ("smooth.\nmrad", 1e3, 2),
     "saturation": ("satur.\n%", 100.0, 1),
     "rotors_at_limit": ("limit\n%", 100.0, 1),
     "rotor_power": ("power\nhover=1", 1.0, 3),

@@ -85,13 +85,9 @@ class Trajectory(NamedTuple):
         """Goal of O at the end, the last one of a sequence of waypoints [m]."""
         return self.target[-1]
 
-    def row(self, number: int) -> Trajectory:
-        """Control step `number`, without the axis of the steps."""
+    def row(self, number: Any) -> Trajectory:
+        """Control step `number`, without the axis of the steps; or the steps of an array of numbers."""
         return Trajectory(*(None if value is None else value[number] for value in self))
-
-    def copied(self) -> Trajectory:
-        """A copy: `world` shares the memory of its whole batch."""
-        return self._each(np.array)
 
     def batched(self) -> Trajectory:
         """A single flight as a batch of one."""

@@ -188,12 +188,6 @@ def test_baselines_beside_a_policy_for_crazyflies_fly_its_plant(
     assert "this plant is another" in capsys.readouterr().err
 
 
-def test_suites_refuse_a_policy_for_crazyflies(capsys: pytest.CaptureFixture[str]) -> None:
-    path = next(path for path in shipped_policies() if path.stem == "flight")
-    assert call(main, ["suites", path, "--only", "gusts"]) == 2
-    assert "was made for another" in capsys.readouterr().err
-
-
 # --- check ----------------------------------------------------------------------------------------------------------
 
 

@@ -1,11 +1,11 @@
-const table = document.getElementById('scores'), body = table.tBodies[0];
-const suite = document.getElementById('suite'), follower = document.getElementById('follower');
+const table = document.getElementById('table'), body = table.tBodies[0];
+const scenario = document.getElementById('scenario'), follower = document.getElementById('follower');
 function show() {
   for (const row of body.rows)
-    row.hidden = (suite.value && row.cells[0].textContent !== suite.value)
-      || (follower.value && row.cells[2].textContent !== follower.value);
+    row.hidden = (scenario.value && row.cells[0].textContent !== scenario.value)
+      || (follower.value && row.cells[1].textContent !== follower.value);
 }
-suite.onchange = follower.onchange = show;
+scenario.onchange = follower.onchange = show;
 table.tHead.onclick = (event) => {
   const cell = event.target.closest('th');
   if (!cell) return;
