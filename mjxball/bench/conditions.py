@@ -22,6 +22,7 @@ POSE_LAG = (0.0, 0.03)  # a position behind the gyro: 13 to 23 ms found [s]
 GAP_RATE = (0.0, 0.25)  # 11 to 22 a minute found [1/s]
 JITTER = (0.0, 0.005)  # of a laptop's period [s]
 THRUST = (0.95, 1.05)  # of a drone, as 2.5 % between flights of one and its propellers leave
+LAG = 0.5  # largest rotor lag times the frequency of the loops: whoever closes fast loops has rotors for them
 # rms of the wind's speed over its mean. Near the ground 0.2 with a length of 8 times the height (Dryden): at 1 m above
 # 1 rad/s as rough as 0.1 with the 1 s of `GUST_TIME`.
 GUST = 0.1
@@ -63,7 +64,8 @@ def in_world(scenario: Scenario, config: Config, random: np.random.Generator, ai
     drag, speed, way = between(air.drag), between(air.wind), between((0.0, 2.0 * math.pi))
     masses = sum(drone.mass for drone in config.plant.drones)
     lowest = min(0.0, scenario.goal[2])
-    loops = math.exp(between((math.log(air.loops[0]), math.log(air.loops[1])))) if air.loops[0] else None
+    own = config.attitude.natural_frequency[0]
+    loops = math.exp(between((math.log(air.loops[0]), math.log(air.loops[1])))) if air.loops[0] else own
     disturbance = Disturbance(
         noise=between(NOISE),
         delay=period * int(random.integers(round(DELAY / period) + 1)),
@@ -80,7 +82,8 @@ def in_world(scenario: Scenario, config: Config, random: np.random.Generator, ai
         disturbance=disturbance,
         thrust=scenario.thrust or tuple(map(float, random.uniform(*THRUST, count))),
         thrust_fade=between(air.fade),
-        loop_scale=1.0 if loops is None else loops / config.attitude.natural_frequency[0],
+        loop_scale=loops / own,
+        rotor_lag_scale=min(1.0, LAG / loops / max(config.plant.of_drones("rotor_lag"))) if air.loops[0] else 1.0,
         rotor_drag=drag,
         wind=(speed * math.cos(way), speed * math.sin(way), 0.0),
         floor=lowest - between(air.clearance) if random.uniform() < 0.5 else None,

@@ -372,7 +372,7 @@ def load_of(config: Config, scenarios: Sequence[Scenario]) -> Load:
 def _air_of(scenarios: Sequence[Scenario]) -> dict[str, Any]:
     """Fields of `Load` that at least one of the scenarios sets: attitude loops, air, fading thrust."""
     still, found = Scenario(), dict[str, Any]()
-    for name in ("loop_scale", "rotor_drag", "wind", "download", "thrust_fade"):
+    for name in ("loop_scale", "rotor_lag_scale", "rotor_drag", "wind", "download", "thrust_fade"):
         values = [getattr(scenario, name) for scenario in scenarios]
         if any(value != getattr(still, name) for value in values):
             found[name] = np.array(values, float)

@@ -63,6 +63,7 @@ class Scenario:
     thrust_fade: float = 0.0  # share of all thrust that is lost in a second [1/s]
     lost: tuple[tuple[int, float], ...] = ()  # (number of a drone, time at which its rotors stop [s])
     loop_scale: float = 1.0  # factor on the natural frequency of ideal attitude loops
+    rotor_lag_scale: float = 1.0  # factor on the rotors' time constant
     rotor_drag: float = 0.0  # of a drone over its mass [1/s]
     wind: Vector3 = (0.0, 0.0, 0.0)  # velocity of the air, felt by rotor drag [m/s]
     floor: float | None = None  # height of the ground, for ground effect; None: no ground [m]
@@ -148,8 +149,8 @@ def _check_goals(config: Config, scenario: Scenario) -> None:
 
 
 def _check_air(config: Config, scenario: Scenario) -> None:
-    if scenario.loop_scale <= 0:
-        raise InputError(f"loop scale must be positive, not {scenario.loop_scale:g}")
+    if min(scenario.loop_scale, scenario.rotor_lag_scale) <= 0:
+        raise InputError("loop scale and rotor lag scale must be positive")
     if scenario.loop_scale != 1 and config.autopilot.kind != "ideal":
         raise InputError("loop scale is of ideal attitude loops; a Crazyflie's gains are those of autopilot")
     if min(scenario.rotor_drag, scenario.thrust_fade) < 0:
