@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from mjxball.arrays import Array
 from mjxball.config import Config
-from mjxball.control import attitude, crazyflie, motors, rotations
+from mjxball.control import attitude, crazyflie, motors
 from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.mounts import own_motion
 from mjxball.plant import PlantParameters, plant_parameters
 
 if TYPE_CHECKING:
@@ -28,11 +29,11 @@ def rotor_targets(
     believed_mass: Scalar,
 ) -> Float[Array, "... drones 4"]:
     """Rotor forces [N] that all ideal attitude loops ask for at `commands` (roll, pitch, vertical acceleration)."""
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+    euler, rates = own_motion(state, parameters.yaw)
     return attitude.rotor_commands(
         commands,
-        euler[..., None, :],
-        state.rates[..., None, :],
+        euler,
+        rates,
         carried_mass(parameters, believed_mass),
         parameters.gains,
         parameters.gravity,
@@ -73,8 +74,7 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
             return with_battery(state, commands, load._replace(battery=zero + motors.USUAL_BATTERY, uncompensated=zero))
         xp, autopilot, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
         sent = crazyflie.setpoints(autopilot, commands, carried_mass(constants, load.believed_mass), gravity)
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        euler, rates = (xp.broadcast_to(each, commands.shape) for each in own_motion(state, constants.yaw))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         loops, duty = crazyflie.cascade(autopilot, state.loops, sent, euler, rates, integrals)
         return loops, crazyflie.motor_force(autopilot.motor_curve, duty)
@@ -108,8 +108,7 @@ def make_battery_autopilot(config: Config, parameters: PlantParameters | None = 
             crazyflie.setpoints(older, commands, carried, gravity),
             crazyflie.setpoints(autopilot, commands, carried, gravity),
         )
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        euler, rates = (xp.broadcast_to(each, commands.shape) for each in own_motion(state, constants.yaw))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
 
