@@ -314,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
             more = {**more[0], **given[0]}, {**more[1], **given[1]}
         check_coupled(config, options)
-        check_mount(config, variants(config, choice, more), mount_of(options))
+        check_mount(config, variants(config, choice, more), mount_of(options, config.plant))
         rig = Rig.from_metadata(policy.metadata)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)
         goal = tuple(options.goal or goal_of(config))

@@ -18,12 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.config import Config
+from mjxball.config import Config, Plant
 from mjxball.control.axes import NAMES, Axis
 from mjxball.errors import InputError
 from mjxfly.margins import REQUIREMENTS, Gains
 
 Array = np.ndarray
+LEAST_DAMPING = 1e-3  # ratio of a mode
 GYRO_CUTOFF = 80.0  # [Hz] of the firmware's filter of the gyroscope, second order
 HIGHEST = 1000.0  # [Hz] modes above it are not looked at: that filter and the motors leave the loop no gain
 # Frequencies over that of a resonance at which its peak is looked for.
@@ -48,21 +49,23 @@ MOUNTED = NAMES[:2]  # axes about which mounts are elastic
 
 def add_mount_options(parser: argparse._ActionsContainer) -> None:
     """Add the flags --mount-hz and --mount-damping to `parser`."""
-    about = "frequency of a drone on its mount (mjxfly.rig.mount): gains must suit every mode from it on (rigid)"
+    about = "frequency of a drone on its mount (mjxfly.rig.mount): gains must suit every mode from it on (the plant's)"
     parser.add_argument("--mount-hz", type=float, metavar="HZ", help=about)
     about = f"--mount-hz: damping ratio of the modes ({RIGID.damping:g})"
     parser.add_argument("--mount-damping", type=float, metavar="RATIO", help=about)
 
 
-def mount_of(options: argparse.Namespace) -> Mount:
-    """The mounts that the flags describe, rigid without them. Raises InputError for values out of range."""
+def mount_of(options: argparse.Namespace, plant: Plant) -> Mount:
+    """The mounts that the flags describe, else those of `plant`. Raises InputError for values out of range."""
     frequency, damping = options.mount_hz, options.mount_damping
+    if plant.mount_frequency and frequency is None and damping is None:
+        return Mount(plant.mount_frequency, max(plant.mount_damping, LEAST_DAMPING))
     if frequency is None and damping is not None:
         raise InputError("--mount-damping needs --mount-hz HZ")
     if frequency is not None and not 1 <= frequency <= HIGHEST:
         raise InputError(f"--mount-hz must be 1 to {HIGHEST:g}, not {frequency:g}")
-    if damping is not None and not 1e-3 <= damping < 1:
-        raise InputError(f"--mount-damping must be at least 0.001 and below 1, not {damping:g}")
+    if damping is not None and not LEAST_DAMPING <= damping < 1:
+        raise InputError(f"--mount-damping must be at least {LEAST_DAMPING:g} and below 1, not {damping:g}")
     return Mount(RIGID.frequency if frequency is None else frequency, RIGID.damping if damping is None else damping)
 
 

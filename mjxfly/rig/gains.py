@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _gains(options: argparse.Namespace) -> int:
     settings = cli.apply_plant(config.preset(options.preset), options.plant)
     _ = settings.plant.pair  # InputError for teams
-    mount = mount_of(options)
+    mount = mount_of(options, settings.plant)
     if options.out:
         cli.output_file(options.out, ".json")
     designs = design(settings, mount)

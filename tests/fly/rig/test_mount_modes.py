@@ -221,6 +221,9 @@ class TestFlight:
         assert command.main(["--mount-hz", "100", "--out", str(out)]) == 0
         assert "from 90 Hz" in capsys.readouterr().out
         assert out.exists()
+        (tmp_path / "soft.json").write_text('{"plant.mount_frequency": 100}')
+        assert command.main(["--plant", str(tmp_path / "soft.json")]) == 0
+        assert "from 90 Hz" in capsys.readouterr().out
         for flags, said in (
             (("--mount-hz", "0.5"), "1 to 1000"),
             (("--mount-damping", "0.1"), "needs --mount-hz"),
