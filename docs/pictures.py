@@ -33,8 +33,9 @@ from mjxball.evaluate.results import fly_scenarios, scenario_title
 from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
 from mjxball.policy.file import policy_path, shipped_policy
+from mjxfly.gain_design import apply, design
 from mjxfly.log import result_of, without_goal
-from mjxfly.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
+from mjxfly.margins import FREQUENCIES, closed_poles, delivered_gains, loop_gain
 from mjxfly.recording import read_recording
 
 REPOSITORY = Path(__file__).parents[1]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ import numpy as np
 
 from mjxball.cli import make_parser, output_file, plant_setup
 from mjxball.config import Attitude, Plant
+from mjxball.errors import InputError
 from mjxball.files import write_atomically
 from mjxball.plant import ROLLING_INERTIA, plant_parameters, rotors
+from mjxball.plant.mounts import hinge
 from mjxball.running import quit_on_interrupt, run_command
 
 ASSEMBLY = "assembly"
@@ -37,13 +40,14 @@ def drone_names(plant: Plant) -> list[str]:
 
 
 def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
-    """MjSpec of the assembly: carrier and shell, welded drones, and the moving mass on one or two slide joints.
+    """MjSpec of the assembly: carrier and shell, drones, and the moving mass on one or two slide joints.
 
-    The drones' centres are at their mounts, turned by their yaw. In the reference plant the shell is massless, and the
-    ball has the object's whole mass with the box's inertia. The root is free, or on a stand: a hinge along x (`pivot`),
-    or a vertical slide and that hinge (`heave`). Each drone has four `motor` actuators, in the drones' order, whose
-    controls are rotor forces [N]; their gear contains the yaw moment. `timestep` [s] affects viewers and MuJoCo's own
-    integrator only.
+    The drones' centres are at their mounts, turned by their yaw; they are welded, or with `plant.mount_frequency` on
+    two hinges each (`plant.mounts`). In the reference plant the shell is massless, and the ball has the object's whole
+    mass with the box's inertia. The root is free, or on a stand: a hinge along x (`pivot`), or a vertical slide and
+    that hinge (`heave`). Each drone has four `motor` actuators, in the drones' order, whose controls are rotor forces
+    [N]; their gear contains the yaw moment. `timestep` [s] affects viewers, MuJoCo's own integrator, and elastic
+    mounts. Raises InputError if it is too long for these.
     """
     parameters = plant_parameters(plant, Attitude())
     fixed, moving = (1 - plant.moving_fraction) * plant.object_mass, plant.moving_fraction * plant.object_mass
@@ -52,6 +56,13 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
     spec.option.timestep = timestep
     spec.option.gravity = [0.0, 0.0, -plant.gravity]
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    if plant.mount_frequency and fixed + plant.carrier_mass == 0:
+        raise InputError(
+            "elastic mounts need a carrier that has a mass: set plant.carrier_mass and carrier_inertia, or "
+            "plant.moving_fraction below 1"
+        )
+    if plant.mount_frequency:  # the hinges' own damping is implicit already, see `plant.mounts.hinge`
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     _add_scenery(spec)
     shell_inertia = parameters.carrier_inertia + plant.object_mass * parameters.shell_inertia_per_mass
@@ -182,6 +193,8 @@ def _add_drone(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, number: i
         ipos=[0, 0, 0],
         inertia=list(mounted.inertia),
     )
+    if plant.mount_frequency:
+        _add_hinges(drone, plant, mounted.inertia, spec.option.timestep)
     _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], colour)
     places, spins = rotors.PLACES[plant.layout], rotors.SPIN[plant.layout]
     for rotor, (axis, spin) in enumerate(zip(places, spins, strict=True), start=1):
@@ -199,6 +212,17 @@ def _add_drone(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, number: i
         motor.gear[:] = [0, 0, 1, 0, 0, spin * yaw_per_thrust]
         motor.ctrllimited = True
         motor.ctrlrange[:] = [0, force]
+
+
+def _add_hinges(drone: mujoco.MjsBody, plant: Plant, inertia: Sequence[float], timestep: float) -> None:
+    """Elastic mount: hinges about the drone's own x, then y; `inertia` about its own axes [kg m2]."""
+    for number, axis in enumerate(("roll", "pitch")):
+        joint = drone.add_joint(name=f"{drone.name}_{axis}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=np.eye(3)[number])
+        own = hinge(plant, inertia[number], timestep)
+        joint.armature = own.armature
+        for field, value in (("stiffness", own.stiffness), ("damping", own.damping)):
+            # MuJoCo 4 takes the coefficients of a polynomial.
+            setattr(joint, field, value if np.ndim(getattr(joint, field)) == 0 else [value, 0.0, 0.0])
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from mjxball.entry import run_module
 
 MAINS = {"view": "view.main", "log": "log", "app": "app.main"}
-MAINS |= {name: f"rig.{name}" for name in ("design", "gains", "identify")}
+MAINS |= {name: f"rig.{name}" for name in ("design", "gains", "identify", "mount")}
 
 
 def run() -> int:

@@ -26,7 +26,8 @@ from mjxfly.crazyswarm import CrazyswarmPair, read_pair
 from mjxfly.display import live_view
 from mjxfly.limits import FlightSettings, Limits
 from mjxfly.mocap import KINDS, MocapSettings, ready
-from mjxfly.parameters import check_parameters
+from mjxfly.mount_modes import add_mount_options, mount_of
+from mjxfly.parameters import check_mount, check_parameters
 from mjxfly.policy_setup import (
     ThrustOptions,
     drone_of,
@@ -104,14 +105,7 @@ def make_parser() -> cli.Parser:
 
     _add_mocap(parser.add_argument_group("motion capture"))
     thrust = parser.add_argument_group("thrust and firmware")
-    add = thrust.add_argument
-    about = "JSON of firmware parameters to upload, for both drones or each, over the policy's"
-    add("--gains", type=Path, metavar="FILE", help=about)
-    about = "m (g + az) through the force curve, or the paper's HOVER + 1000 az (the policy's)"
-    add("--thrust", choices=("calibrated", "paper"), help=about)
-    add("--hover", type=float, metavar="UNITS", help="--thrust paper: thrust at hover (the policy's)")
-    add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
-    add("--mass", type=float, metavar="KG", help="--thrust calibrated: total mass (the policy's)")
+    _add_firmware(thrust)
 
     twin = parser.add_argument_group("faults and surroundings of the twin")
     kinds = ", ".join(FAULT_KINDS)
@@ -123,6 +117,18 @@ def make_parser() -> cli.Parser:
     add_twin_options(twin)
     rare.update(flag for group in (thrust, twin) for action in group._group_actions for flag in action.option_strings)
     return parser
+
+
+def _add_firmware(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    about = "JSON of firmware parameters to upload, for both drones or each, over the policy's"
+    add("--gains", type=Path, metavar="FILE", help=about)
+    about = "m (g + az) through the force curve, or the paper's HOVER + 1000 az (the policy's)"
+    add("--thrust", choices=("calibrated", "paper"), help=about)
+    add("--hover", type=float, metavar="UNITS", help="--thrust paper: thrust at hover (the policy's)")
+    add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
+    add("--mass", type=float, metavar="KG", help="--thrust calibrated: total mass (the policy's)")
+    add_mount_options(group)
 
 
 def _add_mocap(group: argparse._ArgumentGroup) -> None:
@@ -253,10 +259,11 @@ def check_twin_options(options: argparse.Namespace) -> None:
         read_fault(fault)
 
 
-def check_loaded(config: Config) -> None:
-    """Raise InputError if the twin of `config` cannot be loaded in flight."""
-    if not is_crazyflie(config):
-        raise InputError("--twin-load is for policies that were trained on Crazyflies, such as flight")
+def check_coupled(config: Config, options: argparse.Namespace) -> None:
+    """Raise InputError for flags that the twin of `config` does not support."""
+    for name in ("load", "mount"):
+        if getattr(options, f"twin_{name}") is not None and not is_crazyflie(config):
+            raise InputError(f"--twin-{name} is for policies that were trained on Crazyflies, such as flight")
 
 
 def rehearsed_options(options: argparse.Namespace) -> list[str]:
@@ -306,8 +313,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for path, given in parameters_of(options, swarm):
             check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
             more = {**more[0], **given[0]}, {**more[1], **given[1]}
-        if options.twin_load is not None:
-            check_loaded(config)
+        check_coupled(config, options)
+        check_mount(config, variants(config, choice, more), mount_of(options, config.plant))
         rig = Rig.from_metadata(policy.metadata)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)
         goal = tuple(options.goal or goal_of(config))

@@ -1,16 +1,15 @@
-"""Attitude gains for a pair of Crazyflies: the stiffest loop with margins for uncertain lag, inertia and delay."""
+"""Stability margins of a pair's attitude loops, and those that are required for uncertain lag, inertia and delay."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from mjxball.config import Autopilot, Config
 from mjxball.control.axes import Axis, axes
-from mjxball.control.crazyflie import RATE_LIMITS
 
 Array = np.ndarray
 FREQUENCIES = np.geomspace(0.02, 400.0, 1200)  # [rad/s]
@@ -119,59 +118,6 @@ class Requirements:
 REQUIREMENTS = Requirements()
 
 
-class AxisDesign(NamedTuple):
-    """Gains of one axis and their margins."""
-
-    axis: Axis
-    gains: Gains
-    nominal: Margins
-    worst: Margins  # the smallest of each margin over the corners
-
-
-def design(config: Config) -> tuple[AxisDesign, ...]:
-    """Gains for roll, pitch and yaw of the pair in `config`. Raises ValueError if nothing keeps the margins."""
-    return tuple(design_axis(axis, config) for axis in axes(config))
-
-
-def design_axis(axis: Axis, config: Config) -> AxisDesign:
-    """The stiffest of a grid of gains: rate kp, its kd as a lead, attitude kp.
-
-    Only the rate integral holds constant moments; it is sized for `Axis.trim`. Both drones turn one body, so the
-    integrals of two drones that measure it differently drift apart and oppose each other, and that has to stay bounded.
-    An axis with about the inertia of two single drones keeps the delivered gains, which many have flown.
-    """
-    if axis.inertia_ratio < REQUIREMENTS.keep_below:
-        return AxisDesign(
-            axis,
-            delivered_gains(axis),
-            *nominal_and_worst(delivered_gains(axis), axis, config.plant.rotor_lag),
-        )
-    held = max(axis.trim, REQUIREMENTS.unloaded_share * axis.headroom)
-    number = ("roll", "pitch", "yaw").index(axis.name)
-    integral = held / RATE_LIMITS[number]
-    lag = config.plant.rotor_lag
-    for attitude, rate, lead in candidates(axis, lag):
-        gains = rounded(Gains((attitude, 0.0, 0.0), (rate, integral, lead * rate)))
-        nominal = margins(gains, axis.gain, lag, REQUIREMENTS.delay)
-        if nominal.phase < REQUIREMENTS.phase or min(nominal.gain_up, nominal.gain_down) < REQUIREMENTS.gain:
-            continue
-        nominal, worst = nominal_and_worst(gains, axis, lag)
-        if worst.phase >= REQUIREMENTS.worst_phase and min(worst.gain_up, worst.gain_down) >= REQUIREMENTS.worst_gain:
-            return AxisDesign(axis, gains, nominal, worst)
-    raise ValueError(f"no gains keep the margins about {axis.name}")
-
-
-def candidates(axis: Axis, lag: float) -> list[tuple[float, float, float]]:
-    """(attitude kp, rate kp, lead time) within the limits of authority and noise, the stiffest first."""
-    stiffest = 0.5 * axis.headroom / REQUIREMENTS.attitude_error
-    rates, leads = np.geomspace(2.0, 60.0, 35) / axis.gain, np.linspace(0.0, lag, 6)
-    grid = itertools.product(np.geomspace(0.8, 8.0, 24), rates, leads)
-    stable = ((a, r, d) for a, r, d in grid if REQUIREMENTS.bandwidth_ratio * a <= r * axis.gain)
-    kept = [(a, r, d) for a, r, d in stable if a * r <= stiffest and d * r <= REQUIREMENTS.largest_derivative]
-    # Among equally stiff ones less lead first, which means less noise.
-    return sorted(((float(a), float(r), float(d)) for a, r, d in kept), key=lambda c: (-c[0] * c[1], c[2]))
-
-
 def worst_margins(gains: Gains, axis: Axis) -> Margins:
     """Smallest margins over the corners of lag and inertia, at the longest delay."""
     corners = itertools.product(REQUIREMENTS.lags, REQUIREMENTS.inertias)
@@ -184,12 +130,6 @@ def nominal_and_worst(gains: Gains, axis: Axis, lag: float) -> tuple[Margins, Ma
     return margins(gains, axis.gain, lag, REQUIREMENTS.delay), worst_margins(gains, axis)
 
 
-def rounded(gains: Gains) -> Gains:
-    """`gains` to three significant digits, as they are written to the drones."""
-    attitude, rate = ([float(f"{value:.3g}") for value in row] for row in gains)
-    return Gains((attitude[0], attitude[1], attitude[2]), (rate[0], rate[1], rate[2]))
-
-
 def delivered_gains(axis: Axis) -> Gains:
     """The gains that a drone is delivered with."""
     return gains_of(Autopilot(), axis)
@@ -198,10 +138,3 @@ def delivered_gains(axis: Axis) -> Gains:
 def gains_of(autopilot: Autopilot, axis: Axis) -> Gains:
     """The gains of one axis in `autopilot`."""
     return Gains(getattr(autopilot, axis.name), getattr(autopilot, f"{axis.name}_rate"))
-
-
-def apply(autopilot: Autopilot, designs: tuple[AxisDesign, ...]) -> Autopilot:
-    """`autopilot` with the gains of `designs`."""
-    roll, pitch, yaw = (one.gains for one in designs)
-    autopilot = replace(autopilot, roll=roll.attitude, pitch=pitch.attitude, yaw=yaw.attitude)
-    return replace(autopilot, roll_rate=roll.rate, pitch_rate=pitch.rate, yaw_rate=yaw.rate)

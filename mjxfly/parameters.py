@@ -1,7 +1,8 @@
 """Firmware parameters that a file may set on the drones, and checks of its gains.
 
 Gains are checked by the margins of the pair's attitude loop (`margins`), with the gains of one drone on both.
-The loop must be stable with a margin, and about as fast as the one that the policy was trained on.
+The loop must be stable with a margin, and about as fast as the one that the policy was trained on. With --mount-hz all
+gains that are uploaded are checked against the modes of elastic mounts.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from mjxball.errors import InputError
 from mjxball.reading import near
 from mjxfly.limits import NAMES
 from mjxfly.margins import REQUIREMENTS, Margins, gains_of, margins
+from mjxfly.mount_modes import MOUNTED, Mount, has_mode_margin, loop_on_mount, lowest_mode
 from mjxfly.policy_setup import is_crazyflie, with_curve
-from mjxfly.setpoints import CurveName
+from mjxfly.setpoints import CurveName, Variants
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
@@ -47,6 +49,28 @@ def check_parameters(config: Config, curves: Sequence[CurveName], more: PairGain
             own = with_curve(config, curve)
             trained = pair_gains(own.autopilot)[number]
             _check_loops(own, trained, given, f"{where}: the {name}")
+
+
+def check_mount(config: Config, both: Sequence[Variants], mount: Mount) -> None:
+    """Raise InputError if gains of a drone, leader first, lack their margin at a mode from that of `mount` on."""
+    if mount.is_rigid:
+        return
+    if not is_crazyflie(config):
+        raise InputError("--mount-hz is for policies that were trained on Crazyflies, such as flight")
+    for name, own in zip(NAMES, both, strict=True):
+        for curve, variant in own.items():
+            flown = with_curve(config, curve)
+            chosen = {key: value for key, value in variant.gains.items() if key in PARAMETERS}
+            autopilot = with_gains(flown.autopilot, chosen)
+            for axis in axes(flown):
+                loop = loop_on_mount(gains_of(autopilot, axis), axis, flown) if axis.name in MOUNTED else None
+                if loop is not None and not has_mode_margin(loop, mount):
+                    needed = lowest_mode(loop, mount.damping)
+                    raise InputError(
+                        f"--mount-hz {mount.frequency:g}: on the {curve} force curve the {name}'s {axis.name} gains "
+                        f"need mounts of {needed:.0f} Hz: upload others with --gains, which mjxfly.rig.gains "
+                        "--mount-hz computes, or name the firmware's --curve"
+                    )
 
 
 def _check_value(parameter: str, value: float, where: str) -> None:

@@ -33,7 +33,7 @@ from mjxball.policy.file import shipped_policy
 from mjxfly import log
 from mjxfly import main as fly
 from mjxfly.app import main as app
-from mjxfly.rig import design, gains, identify
+from mjxfly.rig import design, gains, identify, mount
 from mjxfly.view import main as view
 
 SECONDS, MEMORY = 20.0, 3.0e9  # [s] of a line, [bytes] resident, at most
@@ -234,7 +234,16 @@ def programs() -> list[Program]:
     flies, flight = (lambda name: ("-m", f"mjxfly.{name}")), str(shipped_policy("flight"))
     balance = str(shipped_policy("balance"))
     text = frozenset(
-        {"--env", "--reward", "--twin-load", "--mocap-option", "--bodies", "--mocap-host", "--coordinator"}
+        {
+            "--env",
+            "--reward",
+            "--twin-load",
+            "--twin-mount",
+            "--mocap-option",
+            "--bodies",
+            "--mocap-host",
+            "--coordinator",
+        }
     )
     learning = ("paper", "--physics", "newton-euler", "--out", "run")
     short = ("copy", "--seconds", "1", "--physics", "newton-euler")
@@ -248,6 +257,7 @@ def programs() -> list[Program]:
         Program("log", flies("log"), ("flight.jsonl", "out"), parser_in(log.main), text),
         Program("gains", flies("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
         Program("design", flies("rig.design"), ("--plant", "team3"), design.parser(), text),
+        Program("mount", flies("rig.mount"), ("flight.jsonl",), mount.parser(), text),
         Program("identify", flies("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
     ]
 
@@ -347,6 +357,7 @@ def files(every: dict[str, Program]) -> Iterator[Case]:
             "log": ("flight.jsonl", "out"),
             "view": ("flight.jsonl", "--out", "page.html"),
             "identify": ("flight.jsonl", "--out", "plant.json"),
+            "mount": ("flight.jsonl",),
         }.items():
             yield Case(name, f"log: {flaw}", (*every[name].start, *line), made)
     for flaw, content in {**ODD_FILES, **series()}.items():
@@ -366,6 +377,7 @@ def numbers(every: dict[str, Program]) -> Iterator[Case]:
             "log": (flaw, "out.csv"),
             "view": (flaw, "--out", "page.html"),
             "identify": (flaw, "--out", "plant.json"),
+            "mount": (flaw,),
         }.items():
             yield Case(name, f"recording: {flaw}", (*every[name].start, *line), {flaw: make})
     for flaw, (file, content) in rigs().items():

@@ -141,6 +141,9 @@ class TestPair:
                     now = step(now, sent, acting)
                 reached.append(now)
         for name, ours, theirs in zip(PlantState._fields, *reached, strict=True):
+            if name.startswith("mount_"):  # rigid mounts
+                assert ours is theirs is None
+                continue
             # An ulp before a truncation moves a motor by a unit: 3e-6 N, 1e-5 of hover; through the body less.
             scale = np.abs(ours).max() or 1.0
             assert np.abs(np.asarray(theirs) - ours).max() < 2e-5 * scale, name

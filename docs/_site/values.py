@@ -32,8 +32,9 @@ from mjxball.policy.formats.c_header import weight_bytes  # noqa: E402
 from mjxball.sim import disturbances  # noqa: E402
 from mjxball.sim.rigs import HELD_OUT_RIGS  # noqa: E402
 from mjxfly.limits import Limits, Times  # noqa: E402
-from mjxfly.margins import REQUIREMENTS  # noqa: E402
+from mjxfly.margins import REQUIREMENTS, gains_of  # noqa: E402
 from mjxfly.mocap_supervision import MocapLimits  # noqa: E402
+from mjxfly.mount_modes import loop_on_mount, lowest_mode  # noqa: E402
 from mjxfly.preflight import Preflight  # noqa: E402
 from mjxfly.twin.conditions import Battery  # noqa: E402
 from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
@@ -126,6 +127,7 @@ NAMES: dict[str, Any] = {
     "ready": Preflight(),
     "battery": Battery(),
     "need": REQUIREMENTS,
+    "modes": [lowest_mode(loop_on_mount(gains_of(pair.autopilot, axis), axis, pair), 0.02) for axis in axes(pair)[:2]],
     "frequency": paper.attitude.natural_frequency,
     "inertia": 2 * stiffness / np.array(paper.attitude.natural_frequency) ** 2,
     "balance": layers("balance"),

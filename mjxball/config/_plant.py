@@ -66,6 +66,13 @@ class Plant:
     rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", low=1e-9, high=1e4)
     yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", low=1e-9, high=1e5)
     gravity: float = setting(9.81, "gravitational acceleration [m/s2]", low=1e-6, high=1e4)
+    mount_frequency: float = setting(
+        0.0,
+        "elastic mounts: frequency of a drone that turns about its own x or y on a carrier held still, 0: rigid [Hz]",
+        low=0,
+        high=1e4,
+    )
+    mount_damping: float = setting(0.02, "damping ratio of that oscillation", low=0, high=1)
 
     def __repr__(self) -> str:
         """A summary; `to_json` gives every setting."""

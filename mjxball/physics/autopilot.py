@@ -9,6 +9,7 @@ from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import attitude, crazyflie, motors, rotations
 from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.mounts import own_motion
 from mjxball.plant import PlantParameters, plant_parameters
 
 if TYPE_CHECKING:
@@ -28,11 +29,11 @@ def rotor_targets(
     load: Load,
 ) -> Float[Array, "... drones 4"]:
     """Rotor forces [N] that all ideal attitude loops ask for at `commands` (roll, pitch, vertical acceleration)."""
-    euler, commands = estimated(state, commands, load)
+    euler, rates, commands = estimated(parameters, state, commands, load)
     return attitude.rotor_commands(
         commands,
         euler,
-        state.rates[..., None, :],
+        rates,
         carried_mass(parameters, load.believed_mass),
         parameters.gains if load.loop_scale is None else attitude.scaled_gains(parameters.gains, load.loop_scale),
         parameters.gravity,
@@ -45,16 +46,17 @@ def rotor_targets(
 
 
 def estimated(
-    state: PlantState, commands: Float[Array, "... drones 3"], load: Load
-) -> tuple[Float[Array, "... drones 3"], Float[Array, "... drones 3"]]:
-    """(roll, pitch, yaw as each drone estimates them, `commands` in body axes as drones with turned mounts fly them).
+    parameters: PlantParameters, state: PlantState, commands: Float[Array, "... drones 3"], load: Load
+) -> tuple[Array, Array, Float[Array, "... drones 3"]]:
+    """(roll, pitch, yaw as each drone estimates them, its body rates, `commands` in body axes as it flies them).
 
-    Where no drone is off, the first has an axis of 1 in place of N.
+    On elastic mounts they have their own (`physics.mounts`), and those with turned mounts fly commands in turned axes.
+    Where all are alike, the first two have an axis of 1 in place of N.
     """
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))[..., None, :]
+    euler, rates = own_motion(state, parameters.yaw)
     if load.attitude_error is None:
-        return euler, commands
-    return euler + load.attitude_error, rotations.turned_about_z(commands, load.attitude_error[..., 2])
+        return euler, rates, commands
+    return euler + load.attitude_error, rates, rotations.turned_about_z(commands, load.attitude_error[..., 2])
 
 
 def carried_mass(parameters: PlantParameters, believed_mass: Scalar) -> Float[Array, "... drones"]:
@@ -85,9 +87,9 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
             zero = commands[..., 0, 0] * 0.0
             return with_battery(state, commands, load._replace(battery=zero + motors.USUAL_BATTERY, uncompensated=zero))
         xp, autopilot, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
-        euler, commands = estimated(state, commands, load)
+        euler, rates, commands = estimated(constants, state, commands, load)
         sent = crazyflie.setpoints(autopilot, commands, carried_mass(constants, load.believed_mass), gravity)
-        euler, rates = (xp.broadcast_to(each, commands.shape) for each in (euler, state.rates[..., None, :]))
+        euler, rates = (xp.broadcast_to(each, commands.shape) for each in (euler, rates))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         loops, duty = crazyflie.cascade(autopilot, state.loops, sent, euler, rates, integrals)
         return loops, crazyflie.motor_force(autopilot.motor_curve, duty)
@@ -116,13 +118,13 @@ def make_battery_autopilot(config: Config, parameters: PlantParameters | None = 
         uncompensated: Array = load.uncompensated
         volts: Array = load.battery
         old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]
-        euler, commands = estimated(state, commands, load)
+        euler, rates, commands = estimated(constants, state, commands, load)
         sent = xp.where(
             old,
             crazyflie.setpoints(older, commands, carried, gravity),
             crazyflie.setpoints(autopilot, commands, carried, gravity),
         )
-        euler, rates = (xp.broadcast_to(each, commands.shape) for each in (euler, state.rates[..., None, :]))
+        euler, rates = (xp.broadcast_to(each, commands.shape) for each in (euler, rates))
         integrals = crazyflie.integral_shares(xp, autopilot, state.rates.dtype, config.plant.count, config.plant.leader)
         rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
 

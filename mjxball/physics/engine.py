@@ -39,6 +39,9 @@ class PlantState(NamedTuple):
     ball_offset: Coordinates  # of a rolling ball from O [m]; unused by prescribed motions
     ball_rate: Coordinates  # [m/s]
     loops: Float[Array, "... drones 13"] | None = None  # of a Crazyflie, see `control.crazyflie`; None: ideal
+    # Drones on elastic mounts, about their own x, then y, from their places on the carrier; None: rigid mounts.
+    mount_angle: Float[Array, "... drones 2"] | None = None  # [rad]
+    mount_rate: Float[Array, "... drones 2"] | None = None  # [rad/s]
 
     def each(self, function: Callable[..., Any], *others: PlantState) -> PlantState:
         """Apply `function` to every leaf that is not None, with the same leaves of `others`."""
@@ -125,15 +128,17 @@ class Wrench(NamedTuple):
 
 class Engine(NamedTuple):
     """Accelerations of the assembly. Both functions return the acceleration of O in the world [m/s2]
-    and the angular acceleration in body axes [rad/s2]; directions that a stand locks are 0.
+    and the angular acceleration in body axes [rad/s2]; directions that a stand locks are 0. With elastic mounts the
+    angular acceleration of `PlantState.mount_angle` (..., N, 2) follows [rad/s2]; the engine then moves the wrenches of
+    `state.rotor_force` from the carrier to the turned drones.
     """
 
     # prescribed(state, wrench, object_mass, cg, added_inertia):
     #   the CG follows `cg`, driven by whatever force that takes
-    prescribed: Callable[[PlantState, Wrench, Scalar, CgState, Vector | None], tuple[Vector, Vector]]
+    prescribed: Callable[[PlantState, Wrench, Scalar, CgState, Vector | None], tuple[Array, ...]]
     # rolling(state, wrench, object_mass, force on the ball along its directions [N], added_inertia):
     #   the ball at state.ball_offset rolls freely; returns its acceleration [m/s2] as well
-    rolling: Callable[[PlantState, Wrench, Scalar, Coordinates, Vector | None], tuple[Vector, Vector, Coordinates]]
+    rolling: Callable[[PlantState, Wrench, Scalar, Coordinates, Vector | None], tuple[Array, ...]]
 
 
 class Air(NamedTuple):

@@ -13,6 +13,7 @@ from mjxball.assembly import ASSEMBLY, BALL, build_model, drone_names
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, solve_small
+from mjxball.physics.mounts import require_rigid
 from mjxball.plant import ROLLING_INERTIA, PlantParameters, plant_parameters
 from mjxball.quiet import import_mjx
 
@@ -33,6 +34,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
     adds its rows. The dynamics do not depend on the assembly's position or linear velocity, so both are 0 here, which
     keeps float32 as accurate as possible.
     """
+    require_rigid(plant, "mjx")
     stages = _Stages(plant, plant_parameters(plant, attitude), parameters)
     share = stages.parameters.moving_fraction
 

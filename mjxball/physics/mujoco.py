@@ -10,9 +10,9 @@ import numpy as np
 
 from mjxball.assembly import ASSEMBLY, BALL, build_model, drone_names
 from mjxball.config import Attitude, Config, Plant
-from mjxball.control import rotations
+from mjxball.control import mixer, rotations
 from mjxball.physics import motion
-from mjxball.physics.engine import CgState, Engine, Load, PlantState, Wrench, rotor_wrenches
+from mjxball.physics.engine import CgState, Engine, Load, PlantState, Wrench, total_wrench
 from mjxball.plant import ROLLING_INERTIA, plant_parameters
 
 if TYPE_CHECKING:
@@ -22,18 +22,23 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Coordinates, Scalar, Vector
 
 
-def make_engine(plant: Plant, attitude: Attitude) -> Engine:
+def make_engine(plant: Plant, attitude: Attitude, step: float = 0.0) -> Engine:
     """Return the C MuJoCo engine of `plant` on NumPy arrays of any batch shape; it computes one environment at a time.
 
     For a prescribed motion the force on the slide that gives the ball its c'' is computed from MuJoCo's mass matrix and
-    applied. The accelerations are then MuJoCo's.
+    applied. The accelerations are then MuJoCo's. Those of elastic mounts are for physics steps of `step` [s], see
+    `plant.mounts.hinge`.
     """
-    world = MujocoWorld(plant, attitude)
-    share = plant.moving_fraction
+    world = MujocoWorld(plant, attitude, step)
+    share, mounted = plant.moving_fraction, 2 * plant.count if plant.mount_frequency else 0
+
+    def split(result: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
+        swing = result[..., 6 : 6 + mounted].reshape(*result.shape[:-1], plant.count, -1)
+        return result[..., :3], result[..., 3:6], result[..., 6 + mounted :], [swing] if mounted else []
 
     def prescribed(
         state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
-    ) -> tuple[Vector, Vector]:
+    ) -> tuple[Array, ...]:
         _refuse(added)
 
         def one(s: PlantState, w: Wrench, mass: float, c: CgState) -> np.ndarray:
@@ -41,12 +46,12 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
             world.push(s, w)
             return world.drive(c.acceleration / share)
 
-        result = _each((state, wrench, object_mass, cg), state.time.shape, one)
-        return result[..., :3], result[..., 3:6]
+        linear, angular, _, swing = split(_each((state, wrench, object_mass, cg), state.time.shape, one))
+        return linear, angular, *swing
 
     def rolling(
         state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Coordinates, added: Vector | None = None
-    ) -> tuple[Vector, Vector, Coordinates]:
+    ) -> tuple[Array, ...]:
         _refuse(added)
 
         def one(s: PlantState, w: Wrench, mass: float, force: Array) -> np.ndarray:
@@ -54,8 +59,8 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
             world.push(s, w)
             return world.roll(force)
 
-        result = _each((state, wrench, object_mass, ball_force), state.time.shape, one)
-        return result[..., :3], result[..., 3:6], result[..., 6] if len(plant.directions) == 1 else result[..., 6:]
+        linear, angular, ball, swing = split(_each((state, wrench, object_mass, ball_force), state.time.shape, one))
+        return linear, angular, ball[..., 0] if len(plant.directions) == 1 else ball, *swing
 
     return Engine(prescribed, rolling)
 
@@ -80,13 +85,15 @@ def _each(arguments: Sequence[Any], shape: tuple[int, ...], function: Any) -> np
 class MujocoWorld:
     """MjModel and MjData of one plant, and the operations that the engine and the contact wrenches need."""
 
-    def __init__(self, plant: Plant, attitude: Attitude):
-        self.model = build_model(plant)
+    def __init__(self, plant: Plant, attitude: Attitude, step: float = 0.0):
+        self.model = build_model(plant, step)
         self.data = mujoco.MjData(self.model)
         self._plant, self._parameters = plant, plant_parameters(plant, attitude)
         self._shell, self._ball = self.model.body(ASSEMBLY).id, self.model.body(BALL).id
         self._drones = [self.model.body(name).id for name in drone_names(plant)]
         self._slides = slice(self.model.nv - len(plant.directions), self.model.nv)
+        hinges = 2 * plant.count if plant.mount_frequency else 0
+        self._hinges = slice(self._slides.start - hinges, self._slides.start)
 
     def place(self, state: PlantState, object_mass: float, offset: Array, rate: Array) -> None:
         """Set mass, positions and velocities, and compute what depends on them; all applied forces are 0 afterwards."""
@@ -103,14 +110,20 @@ class MujocoWorld:
             "pivot": ([roll], [state.rates[0]]),
         }
         position, velocity = root[self._plant.stand]
-        data.qpos[:], data.qvel[:] = [*position, *np.atleast_1d(offset)], [*velocity, *np.atleast_1d(rate)]
+        angle, swing = (() if each is None else np.ravel(each) for each in (state.mount_angle, state.mount_rate))
+        data.qpos[:] = [*position, *angle, *np.atleast_1d(offset)]
+        data.qvel[:] = [*velocity, *swing, *np.atleast_1d(rate)]
         data.qfrc_applied[:] = 0
         data.xfrc_applied[:] = 0
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
 
     def push(self, state: PlantState, wrench: Wrench) -> None:
-        """Apply the rotors' wrench about O to the assembly's body."""
+        """Apply the wrench about O to the assembly's body; the part of rotors on elastic mounts to the drones."""
+        if state.mount_angle is not None:
+            own = total_wrench(self._plant, self._parameters, state.rotor_force)
+            wrench = Wrench(wrench.force - own.force, wrench.torque - own.torque)
+            self.load_drones(state.rotor_force)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         force, torque = matrix @ wrench.force, matrix @ wrench.torque
         origin = self.data.xpos[self._shell]
@@ -118,11 +131,12 @@ class MujocoWorld:
 
     def drive(self, acceleration: Array) -> Float[np.ndarray, " n"]:
         """Accelerate the ball by `acceleration` along its slides and return what `roll` returns."""
-        pushed = self.data.qfrc_applied + self._external() - self.data.qfrc_bias
+        data = self.data
+        pushed = data.qfrc_applied + self._external() + data.qfrc_passive - data.qfrc_bias
         return self.roll(slide_force(self.model, self.data, self._slides, acceleration, pushed))
 
     def roll(self, force: Array) -> Float[np.ndarray, " n"]:
-        """Accelerations (n,): O in the world, angular in body axes, ball; with `force` on the slides [N]."""
+        """Accelerations (n,): O in the world, angular in body axes, mounts, ball; with `force` on the slides [N]."""
         model, data = self.model, self.data
         data.qfrc_applied[self._slides] += force
         mujoco.mj_fwdActuation(model, data)
@@ -132,14 +146,15 @@ class MujocoWorld:
         if self._plant.stand == "free":
             return a.copy()
         rise = a[0] if self._plant.stand == "heave" else 0.0
-        roll = a[self._slides.start - 1]
-        return np.array([0.0, 0.0, rise, roll, 0.0, 0.0, *a[self._slides]])
+        roll = a[self._hinges.start - 1]
+        return np.array([0.0, 0.0, rise, roll, 0.0, 0.0, *a[self._hinges.start :]])
 
-    def load_drones(self, state: PlantState, rotor_force: Float[Array, "drones 4"]) -> None:
-        """Apply each drone's rotor wrench to the drone's body, so that the welds carry it to the object."""
-        matrix = rotations.matrix_from_quaternion(state.quaternion)
-        wrenches = rotor_wrenches(self._plant, self._parameters, rotor_force)
+    def load_drones(self, rotor_force: Float[Array, "drones 4"]) -> None:
+        """Apply each drone's rotor wrench to the drone's body, so that its mount carries it to the object."""
+        own = self._parameters
+        wrenches = mixer.wrench_from_rotors(rotor_force, own.arm, own.yaw_per_thrust, self._plant.layout)
         for body, wrench in zip(self._drones, wrenches, strict=True):
+            matrix = self.data.xmat[body].reshape(3, 3)
             self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
             self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]
 
@@ -199,7 +214,7 @@ def flown_contact_wrenches(
 
     def one(state: PlantState, object_mass: float, ball: CgState, drive: Array) -> np.ndarray:
         world.place(state, object_mass, ball.offset, ball.rate)
-        world.load_drones(state, state.rotor_force)
+        world.load_drones(state.rotor_force)
         world.roll(drive) if rolling else world.drive(drive)
         return world.contact_wrenches(state)
 

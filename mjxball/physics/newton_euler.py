@@ -9,6 +9,7 @@ from mjxball.arrays import Array
 from mjxball.config import Attitude, Plant
 from mjxball.control.rotations import cross, dot, matrix_from_quaternion, rotate, solve_symmetric
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, coordinates, from_coordinates, solve_small
+from mjxball.physics.mounts import require_rigid
 from mjxball.plant import ROLLING_INERTIA, PlantParameters, plant_parameters
 from mjxball.plant.parameters import diagonal, point_inertia, rigid_inertia, rigid_mass, rigid_moment
 
@@ -34,6 +35,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
 
     `parameters` replace those of `plant`; traced ones may differ from environment to environment.
     """
+    require_rigid(plant, "newton-euler")
     params = plant_parameters(plant, attitude) if parameters is None else parameters
     accelerations = {"free": _free, "pivot": _pivot, "heave": _heave}[plant.stand]
     axes, share = plant.directions, params.moving_fraction

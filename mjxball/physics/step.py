@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -87,7 +87,7 @@ def make_plant_step(
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
         wrench = acting_wrench(plant, params, acting, middle, load)
-        linear, angular, ball = accelerate(middle, wrench, load)
+        linear, angular, ball, *swing = accelerate(middle._replace(rotor_force=acting), wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
             rates=state.rates + h * angular,
@@ -95,6 +95,8 @@ def make_plant_step(
             ball_rate=state.ball_rate + h * ball,
             loops=loops,
         )
+        if swing:
+            kicked = kicked._replace(mount_rate=state.mount_rate + h * swing[0])
         return _drift(kicked, h / 2)
 
     def plant_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
@@ -116,17 +118,18 @@ def lag_weights(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any
 
 def make_accelerations(
     config: Config, engine: Engine, parameters: PlantParameters | None = None
-) -> Callable[[PlantState, Wrench, Load], tuple[Vector, Vector, Coordinates]]:
+) -> Callable[[PlantState, Wrench, Load], tuple[Array, ...]]:
     """Return `accelerate(state, wrench, load)` -> accelerations (linear, angular, ball) for any kind of CG motion.
 
-    The ball's acceleration is 0 for prescribed motions, whose offset is a function of time alone.
+    The ball's acceleration is 0 for prescribed motions, whose offset is a function of time alone. That of elastic
+    mounts follows, see `Engine`.
     """
     params = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
     share = params.moving_fraction
     if config.motion.kind == "rolling":
         force = motion.make_rolling_force(config, params)
 
-        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Coordinates]:
+        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
             mass = motion.object_mass(state.time, load)
             on_ball = force(state.ball_offset, state.ball_rate, share * mass)
             return engine.rolling(state, wrench, mass, on_ball, load.added_inertia)
@@ -134,11 +137,11 @@ def make_accelerations(
         return roll
     cg_motion = motion.make_cg_motion(config)
 
-    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Coordinates]:
+    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
         mass = motion.object_mass(state.time, load)
         cg = cg_motion(state.time, load)
-        linear, angular = engine.prescribed(state, wrench, mass, cg, load.added_inertia)
-        return linear, angular, state.ball_rate.__array_namespace__().zeros_like(state.ball_rate)
+        linear, angular, *swing = engine.prescribed(state, wrench, mass, cg, load.added_inertia)
+        return linear, angular, state.ball_rate.__array_namespace__().zeros_like(state.ball_rate), *swing
 
     return follow
 
@@ -195,8 +198,11 @@ def start_state(
     if config.autopilot.kind == "crazyflie":
         each = xp.stack([euler] * config.plant.count, axis=-2)
         loops = crazyflie.start_loops(each, xp.zeros_like(each))
+    still = xp.zeros((*position.shape[:-1], config.plant.count, 2)) if config.plant.mount_frequency else None
     return PlantState(
         loops=loops,
+        mount_angle=still,
+        mount_rate=still,
         position=position,
         quaternion=rotations.quaternion_from_euler(euler),
         velocity=velocity,
@@ -210,13 +216,14 @@ def start_state(
 
 
 def _drift(state: PlantState, h: float) -> PlantState:
-    ticks = state.ticks + 1
+    ticks, mount_angle = state.ticks + 1, cast(Array, state.mount_angle)
     return state._replace(
         position=state.position + h * state.velocity,
         quaternion=rotations.integrate_quaternion(state.quaternion, h * state.rates),
         ticks=ticks,
         time=h * ticks.__array_namespace__().astype(ticks, state.time.dtype),
         ball_offset=state.ball_offset + h * state.ball_rate,
+        mount_angle=None if state.mount_rate is None else mount_angle + h * state.mount_rate,
     )
 
 
@@ -225,7 +232,7 @@ def make_numpy_plant_step(config: Config, physics: str) -> PlantStep:
     if physics == "mujoco":
         from mjxball.physics.mujoco import make_engine
 
-        return make_plant_step(config, make_engine(config.plant, config.attitude))
+        return make_plant_step(config, make_engine(config.plant, config.attitude, config.physics_step))
     if physics not in ENGINES:
         raise InputError(f"unknown physics {physics!r}; choose from {', '.join(ENGINES)}")
     return _compiled_step(config, physics)

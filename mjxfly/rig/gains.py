@@ -10,18 +10,10 @@ from pathlib import Path
 
 from mjxball import cli, config, running
 from mjxball.control.crazyflie import gains_to_json, pair_gains
-from mjxball.errors import InputError
 from mjxball.files import write_atomically
-from mjxfly.margins import (
-    REQUIREMENTS,
-    AxisDesign,
-    Gains,
-    Margins,
-    apply,
-    delivered_gains,
-    design,
-    nominal_and_worst,
-)
+from mjxfly.gain_design import AxisDesign, apply, design, with_margins
+from mjxfly.margins import REQUIREMENTS, delivered_gains
+from mjxfly.mount_modes import MOUNTED, RIGID, Mount, add_mount_options, mount_of
 
 PRESETS = ("flight", "stand")
 
@@ -33,6 +25,7 @@ def parser() -> cli.Parser:
     result.add_argument(
         "--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or file of mjxfly.rig.identify or by hand"
     )
+    add_mount_options(result)
     result.add_argument("--out", type=Path, metavar="GAINS.json", help="write what mjxfly --gains uploads")
     return result
 
@@ -46,13 +39,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _gains(options: argparse.Namespace) -> int:
     settings = cli.apply_plant(config.preset(options.preset), options.plant)
     _ = settings.plant.pair  # InputError for teams
+    mount = mount_of(options, settings.plant)
     if options.out:
         cli.output_file(options.out, ".json")
-    try:
-        designs = design(settings)
-    except ValueError as error:
-        raise InputError(f"{error}: a lighter or shorter stick, or faster motors, would help") from None
-    print(report(designs, settings.plant.rotor_lag))  # noqa: T201
+    designs = design(settings, mount)
+    print(report(designs, settings, mount))  # noqa: T201
     if options.out:
         write_atomically(options.out, parameter_file(apply(settings.autopilot, designs)))
     return 0
@@ -63,23 +54,39 @@ def parameter_file(autopilot: config.Autopilot) -> str:
     return json.dumps(gains_to_json(pair_gains(autopilot)), indent=1) + "\n"
 
 
-def report(designs: Sequence[AxisDesign], lag: float) -> str:
-    """Return a table: per axis the designed and the delivered gains, with nominal and worst margins; `lag` in [s]."""
-    head = ("axis", "inertia", "gains", "attitude kp ki kd", "rate kp ki kd", "phase", "gain", "delay", "worst")
+def report(designs: Sequence[AxisDesign], settings: config.Config, mount: Mount = RIGID) -> str:
+    """Return a table: per axis the designed and the delivered gains, with nominal and worst margins and modes."""
+    head = (
+        "axis",
+        "inertia",
+        "gains",
+        "attitude kp ki kd",
+        "rate kp ki kd",
+        "phase",
+        "gain",
+        "delay",
+        "worst",
+        "modes",
+    )
     rows: list[tuple[str, ...]] = [head]
+    lag = settings.plant.rotor_lag
     for one in designs:
         delivered = delivered_gains(one.axis)
-        name = "kept" if one.gains == delivered else "designed"
-        rows.append(_row(one, name, one.gains, one.nominal, one.worst))
-        rows.append(_row(one, "delivered", delivered, *nominal_and_worst(delivered, one.axis, lag)))
+        rows.append(_row(one, "kept" if one.gains == delivered else "designed"))
+        rows.append(_row(with_margins(delivered, one.axis, settings, mount), "delivered"))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     (low, high), (light, heavy) = REQUIREMENTS.lags, REQUIREMENTS.inertias
     lines += [
         f"margins at {1e3 * lag:.0f} ms motor lag and {1e3 * REQUIREMENTS.delay:.0f} ms loop delay; worst: phase and "
         f"gain over lag {1e3 * low:.0f} to {1e3 * high:.0f} ms, inertia x {light:g} to {heavy:g}, "
-        f"delay {1e3 * REQUIREMENTS.worst_delay:.0f} ms"
+        f"delay {1e3 * REQUIREMENTS.worst_delay:.0f} ms",
+        f"modes: frequencies of a drone on its mount, of damping ratio {mount.damping:g}, at which the loop's gain is "
+        f"at most 1 / {REQUIREMENTS.gain:g}, whatever its phase",
     ]
+    if mount.is_rigid:
+        lowest = max(one.lowest for one in designs)
+        lines.append(f"measure the mount's mode (mjxfly.rig.mount): below {lowest:.0f} Hz it takes gains of --mount-hz")
     for one in designs:
         if one.nominal.phase and not one.worst.phase:
             alone = ", as one drone alone with delivered gains is" if one.gains == delivered_gains(one.axis) else ""
@@ -89,14 +96,17 @@ def report(designs: Sequence[AxisDesign], lag: float) -> str:
     return "\n".join(lines)
 
 
-def _row(one: AxisDesign, label: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
-    gain_texts = (" ".join(f"{value:g}" for value in row) for row in gains)
+def _row(one: AxisDesign, label: str) -> tuple[str, ...]:
+    gain_texts = (" ".join(f"{value:g}" for value in row) for row in one.gains)
+    nominal, worst = one.nominal, one.worst
     inertia = f"{one.axis.inertia_ratio:.1f} x"
     if not nominal.phase:
-        return (one.axis.name, inertia, label, *gain_texts, "unstable", "", "", "unstable")
+        return (one.axis.name, inertia, label, *gain_texts, "unstable", "", "", "unstable", "")
     gain = f"x {nominal.gain_up:.1f}, / {nominal.gain_down:.1f}"
     left = f"{worst.phase:.0f} deg, x {worst.gain_up:.1f}, / {worst.gain_down:.1f}" if worst.phase else "unstable"
-    return (one.axis.name, inertia, label, *gain_texts, f"{nominal.phase:.0f} deg", gain, _ms(nominal.delay), left)
+    modes = f"from {one.lowest:.0f} Hz" if one.axis.name in MOUNTED else ""
+    phase = f"{nominal.phase:.0f} deg"
+    return (one.axis.name, inertia, label, *gain_texts, phase, gain, _ms(nominal.delay), left, modes)
 
 
 def _ms(seconds: float) -> str:

@@ -100,16 +100,16 @@ class OnboardComputers:
         self._resets: set[int] = set()
         self._euler = np.zeros((2, 3))
 
-    def start(self, positions: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray | None = None) -> None:
-        """Initialise the estimators to the true `positions` (2, 3), `quaternion` (4,) and `velocity` (2, 3) or rest."""
+    def start(self, positions: np.ndarray, quaternions: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Initialise the estimators to the true `positions` (2, 3), `quaternions` (2, 4), `velocity` (2, 3) or rest."""
         for number, one in enumerate(self.filters):
             if self.estimators[number] == KALMAN:
-                one.reset(positions[number], quaternion)
+                one.reset(positions[number], quaternions[number])
                 for _ in range(20):
-                    one.correct(positions[number], quaternion, (0.01, 4.5e-3))
+                    one.correct(positions[number], quaternions[number], (0.01, 4.5e-3))
                 if velocity is not None:
                     one.body_velocity = one.matrix.T @ velocity[number]
-            self.plain[number].quaternion = np.array(quaternion)
+            self.plain[number].quaternion = np.array(quaternions[number])
             self._update_euler(number)
         self._loops = crazyflie.start_loops(self._euler, self.imu.filtered[:, 3:])
 
@@ -168,7 +168,7 @@ class OnboardComputers:
     def sense(self, step: int, raw: np.ndarray, where: Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
         """Run the estimators at millisecond `step` on `raw` (2, 6) specific force [m/s2] and rates [rad/s].
 
-        `where` returns the true positions (2, 3), quaternion (4,) and rotation matrix (3, 3).
+        `where` returns the true positions (2, 3), quaternions (2, 4) and the carrier's rotation matrix (3, 3).
         """
         held = self._modes.held
         before = self.imu.filtered
@@ -187,12 +187,14 @@ class OnboardComputers:
                 self._filter(step + drone * PREDICTION // 2, drone)
                 system = self.positioning[drone]
                 if system.due(step):
-                    positions, quaternion, _ = where()
+                    positions, quaternions, _ = where()
                     if isinstance(system, Deck):
-                        system.correct(self.filters[drone], positions[drone], quaternion, samples[drone, 3:], step)
+                        system.correct(
+                            self.filters[drone], positions[drone], quaternions[drone], samples[drone, 3:], step
+                        )
                         self._update_euler(drone)
                     else:
-                        self.receive_pose(drone, *system.measure(positions[drone], quaternion))
+                        self.receive_pose(drone, *system.measure(positions[drone], quaternions[drone]))
             elif step % COMPLEMENTARY_PERIOD == 0:
                 height = float(where()[0][drone, 2])
                 self.plain[drone].update(samples[drone, :3], samples[drone, 3:], height, COMPLEMENTARY_PERIOD * 1e-3)

@@ -11,6 +11,7 @@ from mjxball.config import Config
 from mjxball.control import motors
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.errors import InputError
+from mjxfly.mount_modes import Mount
 
 OLDER_FORCE = motors.OLDER  # [N] coefficients of p^2 and p, p = PWM / 65535: a fit that ignores the voltage
 
@@ -72,6 +73,7 @@ class Surroundings:
     gains: tuple[float, float] = (1.0, 1.0)  # factors on the motor forces of leader and follower
     exact: bool = False  # the estimates are the true state: for comparisons with the simulation
     load: AddedLoad | None = None  # attached in flight
+    mount: Mount | None = None  # of the drones on the stick; None: as in the policy's plant, which is rigid
     seed: int = 0
     pose_loss: float = 0.0  # fraction of the positioning system's poses that are lost
     positioning: str = "mocap"  # positioning system, one of `POSITIONING`
@@ -84,6 +86,7 @@ QUIET = Surroundings()
 
 # Bounds of the flags' values.
 RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
+MOUNT_RANGES = ((1.0, 250.0), (0.0, 1.0))  # of `Mount`; the twin's steps are a quarter of the shortest period
 LOAD_RANGES = ((0.0, 0.1), (-0.15, 0.15), (0.0, 3600.0))  # of `AddedLoad`
 
 
@@ -102,6 +105,8 @@ def add_twin_options(parser: argparse._ActionsContainer) -> None:
     add("--twin-gains", type=float, nargs=2, metavar=("L", "F"), help=f"{about}factors on the motor forces (1 1)")
     about = f"{about}a load put on the stick: kg, m from O toward the leader, s after the motors first turn"
     add("--twin-load", type=float, nargs=3, metavar=("KG", "M", "S"), help=about)
+    about = "--rehearse: elastic mounts: frequency of a drone on the stick, damping ratio (rigid)"
+    add("--twin-mount", type=float, nargs=2, metavar=("HZ", "RATIO"), help=about)
     about = "--rehearse: "
     add("--twin-seed", type=int, metavar="N", help=f"{about}of its noise (0)")
 
@@ -115,10 +120,11 @@ def check_surroundings(options: argparse.Namespace) -> None:
     for value in options.twin_gains or ():
         if not 0.1 <= value <= 3.0:
             raise InputError(f"--twin-gains must be two numbers of 0.1 to 3, not {value:g}")
-    if options.twin_load is not None:
-        for value, (low, high), what in zip(options.twin_load, LOAD_RANGES, ("KG", "M", "S"), strict=True):
+    for name, ranges, parts in (("load", LOAD_RANGES, ("KG", "M", "S")), ("mount", MOUNT_RANGES, ("HZ", "RATIO"))):
+        given = getattr(options, f"twin_{name}") or ()
+        for value, (low, high), what in zip(given, ranges, parts, strict=False):
             if not low <= value <= high:
-                raise InputError(f"--twin-load: {what} must be {low:g} to {high:g}, not {value:g}")
+                raise InputError(f"--twin-{name}: {what} must be {low:g} to {high:g}, not {value:g}")
     if options.twin_positioning not in (None, "mocap"):
         for name in ("deck", "pose_hz"):
             if getattr(options, f"twin_{name}") is not None:
@@ -144,8 +150,9 @@ def surroundings(options: argparse.Namespace) -> Surroundings:
     given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed", "gains")}
     given = {name: tuple(one) if name == "gains" else one for name, one in given.items() if one is not None}
     load = AddedLoad(*options.twin_load) if options.twin_load is not None else None
+    mount = Mount(*options.twin_mount) if options.twin_mount is not None else None
     deck, system = options.twin_deck != "no", options.twin_positioning or "mocap"
-    return Surroundings(deck=deck, load=load, positioning=system, **given)
+    return Surroundings(deck=deck, load=load, mount=mount, positioning=system, **given)
 
 
 @dataclass(frozen=True)

@@ -1,74 +1,29 @@
 """The coupled Crazyflie model of the twin: both drones' computers, motors and batteries on C MuJoCo.
 
-MuJoCo steps the model of `mjxball.assembly` every millisecond. Legs and a floor are added, so that the pair stands on
-the ground (on a stand: at its lowest position) and takes off and lands by contact. Each drone runs the cascade of
-`control.crazyflie` on its estimates. `physics.motion` moves the ball, as in simulation.
+MuJoCo steps the model of `twin.grounded` every millisecond. Each drone runs the cascade of `control.crazyflie` on its
+estimates. `physics.motion` moves the ball, as in simulation.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import mujoco
 import numpy as np
 
-from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
-from mjxball.config import Config, Plant
+from mjxball.assembly import BALL_JOINT, FOLLOWER, LEADER
+from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
 from mjxball.control.crazyflie import with_stock_gains
 from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.mounts import own_quaternion, own_rates
 from mjxball.physics.mujoco import slide_force
 from mjxball.physics.step import lag_weights
 from mjxfly.twin.avionics import TICK, BatteriesAndMotors, OnboardComputers
 from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
+from mjxfly.twin.grounded import STEP, attach_load, grounded_model, with_mount
 from mjxfly.twin.pair import RUNNING, PairState, SupervisorOutputs
-
-STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
-LEG = 0.03  # [m] from a drone's centre down to the centre of its feet
-FOOT_OFFSET = 0.03  # [m] from a drone's centre to its feet, along x and along y
-FOOT = 0.003  # [m] radius of a foot
-
-
-def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
-    """Return the assembly's model with legs, floor and contact; O is at height 0 when the drones stand on the floor."""
-    plant = dataclasses.replace(config.plant, object_mass=object_mass)
-    spec = build_spec(plant, STEP)
-    disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    spec.option.disableflags &= ~int(disabled)
-    floor = spec.geom("floor")
-    lowest = min(drone.mount[2] for drone in plant.drones)
-    floor.pos = [0.0, 0.0, lowest - LEG - FOOT if plant.stand != "pivot" else -1.0]
-    floor.contype, floor.conaffinity = 1, 2
-    for name in (LEADER, FOLLOWER):
-        drone = spec.body(name)
-        places = [(x, y, -LEG) for x in (-FOOT_OFFSET, FOOT_OFFSET) for y in (-FOOT_OFFSET, FOOT_OFFSET)]
-        for place in (*places, (0.0, 0.0, LEG)):
-            leg = drone.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[FOOT, 0, 0], pos=place, mass=0.0)
-            leg.contype, leg.conaffinity, leg.solref = 2, 1, [0.008, 1.0]
-        drone.add_site(name=f"{name}_imu", pos=[0, 0, 0], size=[0.001, 0.001, 0.001])
-        for sensor in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
-            spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu")
-    model = spec.compile()
-    model.actuator_ctrllimited[:] = False  # `BatteriesAndMotors` limits the motors, by the battery's voltage
-    return model
-
-
-def attach_load(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> None:
-    """Fix a point mass of `mass` [kg] to the stick of `model` at `offset` [m] from O, its centre, along the CG axis.
-
-    Position and velocity of O do not change: the load moves with the stick when it is attached.
-    """
-    body, axis = model.body(ASSEMBLY).id, "xy".index(plant.cg_axis)
-    before = float(model.body_mass[body])
-    after = before + mass
-    across = before * mass / after * offset**2  # about the common centre
-    model.body_mass[body] = after
-    model.body_ipos[body][axis] = mass / after * offset
-    model.body_inertia[body] += [0.0 if i == axis else across for i in range(3)]
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-
 
 WORN_SAG = 0.47  # [V] at full power; with 3.0 V the pair falls as with the real firmware: 1.15 m/s after 0.65 s
 SENSED = 6  # values of one drone's accelerometer and gyroscope
@@ -84,17 +39,19 @@ class CoupledPair:
         kind: DroneKind = DELIVERED,
         surroundings: Surroundings = QUIET,
     ):
+        config = with_mount(config, surroundings.mount)
         self.config, self.conditions = config, conditions or Conditions.of(config)
         self.kind, self.surroundings = kind, surroundings
         plant = config.plant
         self.model = grounded_model(config, self.conditions.object_mass)
         self._loaded = False
         self._free, self._heaves = plant.stand == "free", plant.stand == "heave"
+        self._elastic = plant.mount_frequency > 0
         self._roll = 1 if self._heaves else 0  # joint of a stand's roll
         self._mounts = np.array([drone.mount for drone in plant.pair])
         self._slide = self.model.joint(BALL_JOINT).dofadr[0]
         self._slide_position = self.model.joint(BALL_JOINT).qposadr[0]
-        self._body = self.model.body(ASSEMBLY).id
+        self._drones = [self.model.body(name).id for name in (LEADER, FOLLOWER)]
         self._share = plant.moving_fraction
         self._rolling = config.motion.kind == "rolling"
         self._roll_force = motion.make_rolling_force(config)
@@ -128,9 +85,11 @@ class CoupledPair:
         if self._free:
             data.qpos[:7], data.qvel[:6] = [*state.position, *state.quaternion], [*state.velocity, *state.rates]
         else:
-            roll = float(rotations.roll_of_quaternion(state.quaternion))
-            data.qpos[:-1] = [state.position[2], roll][-len(data.qpos) + 1 :]
-            data.qvel[:-1] = [state.velocity[2], state.rates[0]][-len(data.qvel) + 1 :]
+            roll, root = float(rotations.roll_of_quaternion(state.quaternion)), self._roll + 1
+            data.qpos[:root] = [state.position[2], roll][-root:]
+            data.qvel[:root] = [state.velocity[2], state.rates[0]][-root:]
+        if self._elastic and state.mount_angle is not None:
+            self._hinges(data.qpos)[:], self._hinges(data.qvel)[:] = state.mount_angle, state.mount_rate
         data.qpos[self._slide_position], data.qvel[self._slide] = state.ball_offset, state.ball_rate
         self._rotors = np.array(state.rotor_force)
         data.ctrl[:] = self._rotors.ravel()
@@ -143,10 +102,10 @@ class CoupledPair:
     def _settle(self) -> PairState:
         """Initialise sensors and estimators at the pair's true state; return it."""
         mujoco.mj_forward(self.model, self.data)
-        position, _, matrix = self._pose()
+        position, quaternions, matrix = self._pose()
         velocity = self._velocity(matrix)
         self.onboard.imu.settle(self._sensed())
-        self.onboard.start(position, self._quaternion(), velocity)
+        self.onboard.start(position, quaternions, velocity)
         return self._state()
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
@@ -204,8 +163,8 @@ class CoupledPair:
     def _run_cascades(self) -> None:
         """Run both cascades once and set the motors' target forces."""
         if self.surroundings.exact:
-            euler = rotations.euler_from_matrix(self.data.xmat[self._body].reshape(3, 3))
-            pwm = self.onboard.control(np.stack([euler] * 2), np.stack([self._rates()] * 2))
+            euler = rotations.euler_from_matrix(self.data.xmat[self._drones].reshape(2, 3, 3))
+            pwm = self.onboard.control(euler, self._turning())
         else:
             pwm = self.onboard.control()
         self._moving = self._moving or bool((self.onboard.thrust >= crazyflie.IDLE).any())
@@ -215,6 +174,18 @@ class CoupledPair:
     def _rates(self) -> np.ndarray:
         velocity = self.data.qvel
         return velocity[3:6].copy() if self._free else np.array([velocity[self._roll], 0.0, 0.0])
+
+    def _hinges(self, joints: np.ndarray) -> np.ndarray:
+        """(2, 2) view of positions or velocities: each drone on its elastic mount about its own x and y."""
+        end = len(joints) - 1  # the ball's slide is last
+        return joints[end - 4 : end].reshape(2, 2)
+
+    def _turning(self) -> np.ndarray:
+        """Rates (2, 3) of both drones."""
+        both = np.stack([self._rates()] * 2)
+        if not self._elastic:
+            return both
+        return own_rates(both[0], self._hinges(self.data.qpos), self._hinges(self.data.qvel), np.zeros(2))
 
     # The ball.
 
@@ -270,19 +241,21 @@ class CoupledPair:
         return joints[:3] if self._free else np.array([0.0, 0.0, joints[0] if self._heaves else 0.0])
 
     def _pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions (2, 3) of both drones, and the body's quaternion (4,) and rotation matrix (3, 3)."""
+        """Positions (2, 3) and quaternions (2, 4) of both drones, and the stick's rotation matrix (3, 3)."""
         quaternion = self._quaternion()
         matrix = rotations.matrix_from_quaternion(quaternion)
-        return self._of_origin(self.data.qpos) + self._mounts @ matrix.T, quaternion, matrix
+        both = np.stack([quaternion] * 2)
+        if self._elastic:
+            both = own_quaternion(quaternion, self._hinges(self.data.qpos), np.zeros(2))
+        return self._of_origin(self.data.qpos) + self._mounts @ matrix.T, both, matrix
 
     def _velocity(self, matrix: np.ndarray) -> np.ndarray:
         """Velocities (2, 3) of both drones in the world."""
         return self._of_origin(self.data.qvel) + rotations.cross(self._rates(), self._mounts) @ matrix.T
 
     def _state(self) -> PairState:
-        position, quaternion, matrix = self._pose()
-        velocity = self._velocity(matrix)
-        both, turning = np.stack([quaternion] * 2), np.stack([self._rates()] * 2)
+        position, both, matrix = self._pose()
+        velocity, turning = self._velocity(matrix), self._turning()
         if self.surroundings.exact:
             self.onboard.imu.settle(self._sensed())
             report = self.onboard.reported(position, velocity, both, turning, np.full((2, 9), 1e-5))

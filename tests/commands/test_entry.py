@@ -22,7 +22,7 @@ from mjxball import __version__
 MODULES = (
     *("mjxball.export", "mjxball.assembly", "mjxball.view"),
     *("mjxfly", "mjxfly.twin", "mjxfly.watchdog", "mjxfly.view", "mjxfly.log", "mjxfly.app"),
-    *("mjxfly.rig.design", "mjxfly.rig.gains", "mjxfly.rig.identify"),
+    *("mjxfly.rig.design", "mjxfly.rig.gains", "mjxfly.rig.identify", "mjxfly.rig.mount"),
 )
 COMMANDS = (*MODULES, "train.py", "eval.py")
 

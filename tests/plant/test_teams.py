@@ -154,7 +154,7 @@ def test_contact_wrenches_are_those_of_mujoco() -> None:
     for row in range(20):
         one = state.each(lambda leaf: leaf[row])  # noqa: B023
         world.place(one, mass[row], motion.offset[row] / share, motion.rate[row] / share)
-        world.load_drones(one, one.rotor_force)
+        world.load_drones(one.rotor_force)
         world.drive(motion.acceleration[row] / share)
         expected = world.contact_wrenches(one)
         # 1e-9 of newtons and newton metres of order 10: MuJoCo moves torques between points

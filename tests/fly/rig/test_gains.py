@@ -15,11 +15,11 @@ from mjxball.cli import read_plant
 from mjxball.config import Autopilot, apply_overrides, preset, with_plant
 from mjxball.control.axes import axes
 from mjxball.errors import InputError
+from mjxfly.gain_design import design
 from mjxfly.margins import (
     REQUIREMENTS,
     Gains,
     delivered_gains,
-    design,
     gains_of,
     is_stable,
     margins,

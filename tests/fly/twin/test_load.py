@@ -13,7 +13,8 @@ from mjxball import config as configs
 from mjxball.policy import shipped_policy
 from mjxfly.main import main
 from mjxfly.twin.conditions import AddedLoad, Surroundings
-from mjxfly.twin.coupled import CoupledPair, attach_load, grounded_model
+from mjxfly.twin.coupled import CoupledPair
+from mjxfly.twin.grounded import attach_load, grounded_model
 
 REFUSALS = [
     (TRANSPORT, "0.004 0.05 5", "trained on Crazyflies"),
