@@ -70,6 +70,7 @@ def in_world(scenario: Scenario, config: Config, random: np.random.Generator, ai
         noise=between(NOISE),
         delay=period * int(random.integers(round(DELAY / period) + 1)),
         gust=drag * masses * GUST * speed,
+        gust_seed=int(random.integers(2**31)),
         estimator_drift=between(DRIFT),
         quantize=air.quantized,
         offset=OFFSET,

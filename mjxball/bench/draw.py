@@ -200,5 +200,5 @@ def with_perfect_sensors(scenario: Scenario) -> Scenario:
     What acts on the plant is not part of the sensors, and stays.
     """
     rough = scenario.disturbance
-    kept = dataclasses.replace(type(rough)(), gust=rough.gust, seed=rough.seed)
+    kept = dataclasses.replace(type(rough)(), gust=rough.gust, gust_seed=rough.gust_seed)
     return dataclasses.replace(scenario, disturbance=kept, believed_mass=None)

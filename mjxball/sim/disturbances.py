@@ -37,6 +37,7 @@ class Disturbance:
     delay: float = 0.0  # of the followers' measurements, a multiple of the control period [s]
     gust: float = 0.0  # rms of a random force on O, each axis of the world [N]
     seed: int = 0
+    gust_seed: int | None = None  # of the gusts; None: `seed`
     estimator_drift: float = 0.0  # slow error of the followers' measurements, in units of `DRIFT`
     quantize: bool = False  # measurements arrive with the resolution `RESOLUTION`
     offset: float = 0.0  # constant errors of each drone, in units of `OFFSET` and `ATTITUDE_OFFSET`
@@ -80,8 +81,15 @@ def sensors_of(
     if len(own) > 1:
         raise InputError("flights of one batch must all have a sensor of the object, or none of them")
     keep = np.exp(-period / np.maximum(lags, 1e-9)) if lags.any() else None
-    exact = (one for one in disturbances if one != Disturbance(gust=one.gust, seed=one.seed, jitter=one.jitter))
+    exact = (one for one in disturbances if one != _of_plant(one))
     return SensorModel(int(delays.max()), quantized, own.pop(), any(True for _ in exact)), SensorSettings(delays, keep)
+
+
+def _of_plant(disturbance: Disturbance) -> Disturbance:
+    """`disturbance` without what it does to measurements."""
+    return Disturbance(
+        gust=disturbance.gust, seed=disturbance.seed, gust_seed=disturbance.gust_seed, jitter=disturbance.jitter
+    )
 
 
 def record(
@@ -171,7 +179,8 @@ def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndar
     """(count, 3) first-order Gauss-Markov force [N] that starts in its steady state."""
     if not disturbance.gust:
         return None
-    return disturbance.gust * _walk(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
+    seed = disturbance.seed if disturbance.gust_seed is None else disturbance.gust_seed
+    return disturbance.gust * _walk(np.random.default_rng([seed, 3]).standard_normal((count, 3)), period / GUST_TIME)
 
 
 def _walk(fresh: Float[np.ndarray, "count ..."], share: Any) -> Float[np.ndarray, "count ..."]:
