@@ -208,7 +208,7 @@ def _sample_crazyflie(config: Config, random: np.random.Generator, condition: st
         seconds=SECONDS,
     )
     scenario = _as_in(condition, scenario, config, random, CRAZYFLIE)
-    known = scenario.believed_mass, (), False, scenario.thrust
+    known = scenario.believed_mass, (), False, scenario.thrust or (1.0, 1.0)
     trims = [largest_margin(config, scenario.mass, side * scenario.amplitude, *known) for side in (-1, 1)]
     return scenario if min(trim.margin for trim in trims) >= MARGIN else None
 
