@@ -15,9 +15,9 @@ from mjxball.baselines.assembly_model import AssemblyModel
 from mjxball.config import Config
 from mjxball.control.followers import copy_gains
 from mjxball.control.observation import ERROR, OBSERVATION_SIZE, copy_command
-from mjxball.physics.step import lag_weights
 from mjxball.plant import plant_parameters
 from mjxball.plant.parameters import point_inertia, rigid_mass, rigid_moment
+from mjxball.plant.rotors import lag_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Float

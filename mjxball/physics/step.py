@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, cast
@@ -19,6 +18,7 @@ from mjxball.physics import aerodynamics, motion
 from mjxball.physics.autopilot import Autopilot, carried_mass, make_autopilot
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench, total_wrench
 from mjxball.plant import PlantParameters, plant_parameters
+from mjxball.plant.rotors import lag_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -103,17 +103,6 @@ def make_plant_step(
         return repeat(lambda s: physics_step(s, commands, load), config.timing.physics_steps, state)
 
     return plant_step
-
-
-def lag_weights(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
-    """Weights of the old rotor force after a step of `h` [s] and in its mean over the step; `lag` and `h` in [s]."""
-    if scale is None and isinstance(lag, float):
-        keep = math.exp(-h / lag)
-        return keep, lag / h * (1 - keep)
-    each: Array = lag if scale is None else lag * scale[..., None]
-    scaled = each[..., None]
-    left = scaled.__array_namespace__().exp(-h / scaled)
-    return left, scaled / h * (1 - left)
 
 
 def make_accelerations(

@@ -24,6 +24,20 @@ def lever(arm: Any, layout: str) -> Any:
     return arm if layout == "plus" else arm / math.sqrt(2)
 
 
+def lag_weights(lag: Any, scale: Any, h: float) -> tuple[Any, Any]:
+    """Weights of the old rotor force after a step of `h` [s] and in its mean over the step.
+
+    `lag` is a number or (..., N) [s], `scale` (...) a factor on it, or None.
+    """
+    if scale is None and isinstance(lag, float):
+        keep = math.exp(-h / lag)
+        return keep, lag / h * (1 - keep)
+    each = lag if scale is None else lag * scale[..., None]
+    scaled = each[..., None]
+    left = scaled.__array_namespace__().exp(-h / scaled)
+    return left, scaled / h * (1 - left)
+
+
 def blocked_shares(plant: Plant) -> Float[np.ndarray, "drones 4"]:
     """Share of each rotor's wake that falls on the object of `plant`, see `shares_on_object`."""
     mounts, yaw = np.array([drone.mount for drone in plant.drones]), np.array([drone.yaw for drone in plant.drones])

@@ -19,7 +19,7 @@ from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mounts import own_quaternion, own_rates
 from mjxball.physics.mujoco import slide_force
-from mjxball.physics.step import lag_weights
+from mjxball.plant.rotors import lag_weights
 from mjxfly.twin.avionics import TICK, BatteriesAndMotors, OnboardComputers
 from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxfly.twin.grounded import STEP, attach_load, grounded_model, with_mount

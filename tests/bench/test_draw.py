@@ -17,6 +17,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
 from mjxball.plant.trim import largest_margin
 from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.goals import GoalMotion
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -35,14 +36,14 @@ def test_stored_flights_are_those_that_the_source_samples(track: str) -> None:
     for condition in CONDITIONS:
         assert sum(one.condition == condition for one in flights) == FLIGHTS
     assert all(one.deadline <= one.scenario.seconds - draw.LEFT for one in flights)
-    assert all(one.scenario.disturbance == Disturbance() for one in flights if one.condition == "calm")
+    assert all(one.scenario.disturbance == Disturbance(offset=1.0) for one in flights if one.condition == "calm")
 
 
 @pytest.mark.parametrize("track", STORED)
 def test_no_flight_tells_of_another(track: str) -> None:
     """Not of another condition either: goals, phases and amplitudes are all different."""
     flights = [one.scenario for one in flights_of(track)]
-    for name in ("goal", "phase", "amplitude"):
+    for name in ("goal_motion" if track == "moving" else "goal", "phase", "amplitude"):
         assert len({getattr(one, name) for one in flights}) == len(flights)
 
 
@@ -79,9 +80,9 @@ def test_stored_arrivals_are_those_of_the_oracle_flown_alone() -> None:
 
 
 def test_the_oracle_knows_the_mass_and_flies_without_noise_and_delay() -> None:
-    rough = Disturbance(noise=1.0, delay=0.04, gust=0.2, seed=3, estimator_drift=1.0, quantize=True)
+    rough = Disturbance(noise=1.0, delay=0.04, gust=0.2, seed=3, gust_seed=4, estimator_drift=1.0, offset=1.0)
     found = with_perfect_sensors(Scenario(mass=0.5, believed_mass=0.2, disturbance=rough))
-    assert found == Scenario(mass=0.5, disturbance=Disturbance(gust=0.2, seed=3))
+    assert found == Scenario(mass=0.5, disturbance=Disturbance(gust=0.2, gust_seed=4))
 
 
 def one_plant(monkeypatch: pytest.MonkeyPatch, plant: PlantFlights) -> None:
@@ -116,8 +117,11 @@ def test_a_track_without_successes_of_the_oracle_ends(monkeypatch: pytest.Monkey
 
 
 def test_a_moving_goal_has_its_own_deadline() -> None:
-    """A goal that is where the object begins is followed from the start; one a metre away is not within 3 s."""
-    near, far = (Scenario(goal=(place,) * 3, omega=0.0, amplitude=0.0, seconds=9.0) for place in (0.0, 1.0))
+    """A goal that is where the object begins is followed from the start; one that runs away is not within 3 s."""
+    near, far = (
+        Scenario(goal=(0.0,) * 3, omega=0.0, amplitude=0.0, seconds=9.0, goal_motion=GoalMotion(velocity=(v, 0.0, 0.0)))
+        for v in (0.0, 4.0)
+    )
     config = preset("paper")
     assert oracle_arrivals(config, [near, far], np.full(2, 0.02), moving=True) == [0.0, None]
 
