@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -20,32 +21,39 @@ from mjxball.errors import FOREIGN, InputError, said
 from mjxball.evaluate.followers import answered
 
 
+@dataclass
+class Made:
+    """A follower made for one plant, and what its drones believe the object's mass to be in each flight."""
+
+    follower: Any
+    believed: np.ndarray  # (n,) [kg]
+
+
 class Host:
     """Answers frames for the follower that `text` names."""
 
     def __init__(self, text: str):
         self._name, self._make = entrant(text)
-        self._follower: Any = None
-        self._believed: np.ndarray = np.zeros(0)
+        self._made: list[Made] = []
 
     def answer(self, kind: bytes, content: bytes) -> bytes:
         """The frame that answers one of `kind`. Raises InputError if the follower does not do its part."""
         if kind == frames.LOAD:
-            self._follower = self._make(from_record(json.loads(content)))
-            refuse_privileged(self._follower)
-            return frames.frame(frames.READY, bytes([residual_on_pid(self._follower)]))
+            made = self._make(from_record(json.loads(content)))
+            refuse_privileged(made)
+            self._made.append(Made(made, np.zeros(0)))
+            return frames.frame(frames.READY, bytes([residual_on_pid(made)]))
+        (number,) = frames.NUMBER.unpack_from(content)
+        own, values = self._made[number], frames.unpacked(content[frames.NUMBER.size :])
         if kind == frames.RESET:
-            self._believed = frames.unpacked(content)
-            self._follower.reset()
+            own.believed = values
+            own.follower.reset()
             return frames.frame(frames.READY)
-        observation = frames.unpacked(content)
-        if isinstance(self._follower, Baseline):
-            several = observation.ndim - 1 - self._believed.ndim
-            believed = np.reshape(self._believed, self._believed.shape + (1,) * several)
-            self._follower.privileged = PrivilegedInfo.of_believed(
-                np.broadcast_to(believed, observation.shape[:-1]).copy()
-            )
-        command = answered(self._name, self._follower(observation), observation)
+        if isinstance(own.follower, Baseline):
+            several = values.ndim - 1 - own.believed.ndim
+            believed = np.reshape(own.believed, own.believed.shape + (1,) * several)
+            own.follower.privileged = PrivilegedInfo.of_believed(np.broadcast_to(believed, values.shape[:-1]).copy())
+        command = answered(self._name, own.follower(values), values)
         return frames.frame(frames.COMMAND, frames.packed(command))
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from mjxball.baselines import make_baseline
 from mjxball.bench import CONDITIONS, NAME, VERSION
+from mjxball.bench.flying import ENGINE
 from mjxball.bench.success import deadline, reasons
 from mjxball.bench.tracks import TRACKS, PlantFlights, candidate
 from mjxball.config import Config
@@ -27,7 +28,6 @@ from mjxball.errors import InputError
 from mjxball.evaluate.metrics import fly_and_measure
 from mjxball.sim.scenario import Scenario
 
-ENGINE = "newton-euler"
 STORED_DRAW = 0
 LEFT = 5.0  # time of a flight that is left after the deadline [s], in which the object must stay
 MOST_TRIES = 20  # candidates over wanted flights, of which so few suffice that the track is no track for the oracle

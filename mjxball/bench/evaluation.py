@@ -16,11 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.bench.draw import ENGINE, Flight, Group, groups_of
+from mjxball.bench.draw import Flight, Group, groups_of
+from mjxball.bench.flying import Part, fly, together
 from mjxball.bench.process import FollowerProcess
 from mjxball.bench.success import reasons
 from mjxball.errors import InputError
-from mjxball.evaluate.metrics import Metrics, fly_and_measure
+from mjxball.evaluate.metrics import Metrics
 from mjxball.sim.rollout import load_of
 from mjxball.sim.scenario import Scenario
 
@@ -62,27 +63,37 @@ def evaluate(
     Plants and their flights, of both conditions at once, come in an order of the key.
     """
     groups = groups_of(track, draw)
+    batches = together([group.config for group in groups])
     found: list[Result] = []
-    order = np.random.default_rng(seed_of(key, track, "plants")).permutation(len(groups))
-    for done, plant in enumerate(map(int, order)):
-        progress(f"{track}: {done + 1}/{len(groups)}")
-        found += _fly(groups[plant], plant, f"{key}:{track}", process)
+    order = np.random.default_rng(seed_of(key, track, "batches")).permutation(len(batches))
+    for done, number in enumerate(order):
+        progress(f"{track}: {done + 1}/{len(batches)}")
+        plants = np.random.default_rng(seed_of(key, track, "plants", int(number))).permutation(batches[number])
+        found += _fly({int(plant): groups[plant] for plant in plants}, f"{key}:{track}", process)
         process.check_alone()
     return sorted(found, key=lambda one: (one.plant, one.flight.condition, one.flight.candidate))
 
 
-def _fly(group: Group, plant: int, key: str, process: FollowerProcess) -> list[Result]:
-    order = np.random.default_rng(seed_of(key, plant, "flights")).permutation(len(group.flights))
-    flights = [group.flights[number] for number in order]
-    scenarios = [with_seed(one, key, plant) for one in flights]
-    follower, begun = process.follower(group.config), process.cpu_time
-    follower.believed_mass = load_of(group.config, scenarios).believed_mass
-    radii, deadlines = (np.array([getattr(one, name) for one in flights]) for name in ("radius", "deadline"))
-    flown, metrics = fly_and_measure(group.config, [(follower, scenarios)], ENGINE, radii, deadlines)
-    cpu_time = (process.cpu_time - begun) / (len(flown.time) * len(flights))
+def _fly(groups: dict[int, Group], key: str, process: FollowerProcess) -> list[Result]:
+    """Flights on plants, by their numbers, as one batch."""
+    flown: list[tuple[int, Flight]] = []
+    parts = []
+    for plant, group in groups.items():
+        order = np.random.default_rng(seed_of(key, plant, "flights")).permutation(len(group.flights))
+        flights = [group.flights[number] for number in order]
+        scenarios = [with_seed(one, key, plant) for one in flights]
+        follower = process.follower(group.config)
+        follower.believed_mass = load_of(group.config, scenarios).believed_mass
+        radii, deadlines = (np.array([getattr(one, name) for one in flights]) for name in ("radius", "deadline"))
+        parts.append(Part(group.config, follower, scenarios, radii, deadlines))
+        flown += [(plant, flight) for flight in flights]
+    begun = process.cpu_time
+    metrics = fly(parts)
+    steps = round(flown[0][1].scenario.seconds / parts[0].config.timing.control_period) + 1
+    cpu_time = (process.cpu_time - begun) / (steps * len(flown))
     return [
         Result(plant, flight, one, reasons(one, flight.deadline, cpu_time))
-        for flight, one in zip(flights, metrics, strict=True)
+        for (plant, flight), one in zip(flown, metrics, strict=True)
     ]
 
 

@@ -13,10 +13,12 @@ import numpy as np
 from mjxball.errors import InputError
 
 HEAD = struct.Struct(">cI")  # kind, bytes that follow
-# To the follower: load it for a configuration, reset it with believed masses, an observation.
+# To the follower: make it for a configuration; then, behind the number of that one, reset it with believed masses, an
+# observation.
 LOAD, RESET, OBSERVATION = b"L", b"R", b"O"
 # From it: it is ready, a command, why there is none.
 READY, COMMAND, ERROR = b"K", b"C", b"E"
+NUMBER = struct.Struct(">H")  # of the follower, in the order in which they were made
 MAX_BYTES = 2**26  # of a frame
 MAX_TEXT = 400  # bytes of an error
 MAX_DIMENSIONS = 4

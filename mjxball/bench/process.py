@@ -51,7 +51,7 @@ class FollowerProcess:
     """
 
     def __init__(self, name: str, text: str):
-        self.name, self._patience = name, PATIENCE
+        self.name, self._patience, self._made = name, PATIENCE, 0
         receive, self._send = os.pipe()
         self._receive, send = os.pipe()
         command = [sys.executable, "-P", "-m", "mjxball.bench.child", str(receive), str(send), text]
@@ -98,7 +98,8 @@ class FollowerProcess:
     def follower(self, config: Config) -> RemoteFollower:
         """The follower made for the nominal plant of `config`; RefusalError if it does not fly that plant."""
         content = self.ask(frames.LOAD, json.dumps(to_dict(config)).encode(), frames.READY)
-        return RemoteFollower(self, config, content == b"\x01")
+        self._made += 1
+        return RemoteFollower(self, self._made - 1, config, content == b"\x01")
 
     def check_cpu_time(self, config: Config) -> float:
         """Median CPU time of a control step of one flight at rest [s]; InputError if it exceeds `MAX_CPU_TIME`."""
@@ -188,18 +189,19 @@ class RemoteFollower:
     Set `believed_mass` (n,) [kg] of n flights before a reset.
     """
 
-    def __init__(self, process: FollowerProcess, config: Config, residual_on_pid: bool):
-        self.name, self.residual_on_pid = process.name, residual_on_pid
+    def __init__(self, process: FollowerProcess, number: int, config: Config, residual_on_pid: bool):
+        self.name, self.residual_on_pid, self._number = process.name, residual_on_pid, frames.NUMBER.pack(number)
         self.believed_mass: np.ndarray = np.zeros(0)
         self._process, self._limits = process, (config.command.tilt_limit, config.command.vertical_limit)
 
     def reset(self) -> None:
         """See `Follower.reset`."""
-        self._process.ask(frames.RESET, frames.packed(self.believed_mass), frames.READY)
+        self._process.ask(frames.RESET, self._number + frames.packed(self.believed_mass), frames.READY)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """See `Follower.__call__`; InputError if it sends no command."""
-        content = self._process.ask(frames.OBSERVATION, frames.packed(observation), frames.COMMAND, len(observation))
+        sent = self._number + frames.packed(observation)
+        content = self._process.ask(frames.OBSERVATION, sent, frames.COMMAND, len(observation))
         command = checked_command(self.name, frames.unpacked(content), observation)
         if not (np.abs(command) <= MAX_COMMAND).all():
             raise InputError(

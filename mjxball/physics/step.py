@@ -216,15 +216,18 @@ def _drift(state: PlantState, h: float) -> PlantState:
     )
 
 
-def make_numpy_plant_step(config: Config, physics: str) -> PlantStep:
-    """Return an engine's step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine."""
+def make_numpy_plant_step(config: Config, physics: str, parameters: PlantParameters | None = None) -> PlantStep:
+    """Return an engine's step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine.
+
+    `parameters` (n, ...) of the closed form are those of each flight's plant, all of the `structure` of `config`.
+    """
     if physics == "mujoco":
         from mjxball.physics.mujoco import make_engine
 
         return make_plant_step(config, make_engine(config.plant, config.attitude, config.physics_step))
     if physics not in ENGINES:
         raise InputError(f"unknown physics {physics!r}; choose from {', '.join(ENGINES)}")
-    return _compiled_step(config, physics)
+    return _compiled_step(config, physics, parameters)
 
 
 def make_jax_plant_step(config: Config, physics: str, parameters: PlantParameters | None = None) -> PlantStep:
@@ -239,10 +242,10 @@ def make_jax_plant_step(config: Config, physics: str, parameters: PlantParameter
     return make_plant_step(config, make(config.plant, config.attitude, parameters), jax_repeat, parameters)
 
 
-def _compiled_step(config: Config, physics: str) -> PlantStep:
-    parameters = plant_parameters(config.plant, config.attitude)
-    shared = physics == "newton-euler" and config.autopilot.kind == "ideal" and config.motion.kind != "waveform"
-    compiled = _compiled(_structure(config) if shared else config, physics, shared)
+def _compiled_step(config: Config, physics: str, each: PlantParameters | None) -> PlantStep:
+    alike = structure(config) if physics == "newton-euler" else None
+    compiled = _compiled(alike or config, physics, alike is not None, 0 if each else None)
+    parameters = each or plant_parameters(config.plant, config.attitude)
 
     def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
         import jax
@@ -253,8 +256,13 @@ def _compiled_step(config: Config, physics: str) -> PlantStep:
     return stepper
 
 
-def _structure(config: Config) -> Config:
-    """What decides the program of a closed-form step, whose parameters are arguments: one serves plants alike."""
+def structure(config: Config) -> Config | None:
+    """What decides the program of a closed-form step whose parameters are arguments, so that one serves many plants.
+
+    None where a program is of one plant: of Crazyflies, and of loads that follow samples.
+    """
+    if config.autopilot.kind != "ideal" or config.motion.kind == "waveform":
+        return None
     plant = config.plant
     alike = Plant(
         drones=(Drone(),) * plant.count,
@@ -267,8 +275,11 @@ def _structure(config: Config) -> Config:
 
 
 @functools.lru_cache(maxsize=16)  # compiling takes seconds
-def _compiled(config: Config, physics: str, shared: bool) -> Any:
-    """`step(parameters, state, commands, load)` for batches; `parameters` are constants of `config` unless `shared`."""
+def _compiled(config: Config, physics: str, shared: bool, axis: int | None) -> Any:
+    """`step(parameters, state, commands, load)` for batches; `parameters` are constants of `config` unless `shared`.
+
+    `axis` of the batch in `parameters`; None: all flights have the same.
+    """
     import jax
 
     from mjxball.xla import enable_compilation_cache
@@ -279,7 +290,7 @@ def _compiled(config: Config, physics: str, shared: bool) -> Any:
         return make_jax_plant_step(config, physics, parameters if shared else None)(*arguments)
 
     with jax.enable_x64(True), on_the_host():
-        return jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))
+        return jax.jit(jax.vmap(step, in_axes=(axis, 0, 0, 0)))
 
 
 def on_the_host() -> AbstractContextManager[Any]:

@@ -112,9 +112,12 @@ class ScenarioArrays(NamedTuple):
     settings: SensorSettings
 
 
-def scenario_arrays(config: Config, scenarios: Sequence[Scenario]) -> ScenarioArrays:
-    """`scenarios`, checked, as arrays; InputError unless all last equally long."""
-    scenarios = [check_scenario(config, scenario) for scenario in scenarios]
+def scenario_arrays(config: Config, scenarios: Sequence[Scenario], start: PlantState | None = None) -> ScenarioArrays:
+    """`scenarios`, checked, as arrays; InputError unless all last equally long.
+
+    `start`: the states in which complete and checked scenarios begin, on plants that are not that of `config`.
+    """
+    scenarios = scenarios if start else [check_scenario(config, scenario) for scenario in scenarios]
     if len({scenario.seconds for scenario in scenarios}) != 1:
         raise InputError("scenarios of one batch must last equally long")
     period, followers = config.timing.control_period, followers_axis(config)
@@ -125,7 +128,7 @@ def scenario_arrays(config: Config, scenarios: Sequence[Scenario]) -> ScenarioAr
     before, after = (Goal(*(part if part is None else part[rows] for part in goals)) for rows in ENDS)
     # The time is exact, so that a mass change falls on the same row for every engine.
     inputs = Inputs(np.arange(steps) * period, before, after, during.force, during.late, later)
-    load, start = load_of(config, scenarios), start_of(config, scenarios)
+    load, start = load_of(config, scenarios), start or start_of(config, scenarios)
     first = samples.at(0)._replace(force=None, late=None)
     return ScenarioArrays(load, start, inputs, first, *sensors_of(disturbances, period, followers))
 
@@ -157,7 +160,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     All scenarios must last equally long. Each follower is called once per control step for its own part.
     """
     validate(config)
-    controller = _Together(flights)
+    controller = Together(flights)
     flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
     on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
     privileged = make_privileged_info(config) if controller.needs_privileged else lambda *_: None
@@ -182,7 +185,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     )
 
 
-class _Together:
+class Together:
     """The followers of `flights` as one controller of the whole batch, each for its own scenarios."""
 
     name = "together"
