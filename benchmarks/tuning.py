@@ -21,9 +21,10 @@ import dataclasses
 import functools
 import json
 import math
+import multiprocessing
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,12 +43,14 @@ from mjxball.physics import newton_euler
 from mjxball.physics.step import jax_repeat, make_plant_step
 from mjxball.scalar_form import scalar_form
 from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
 DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
 BOUNDS = {"calm": 0.01, "rough": 0.02}  # [m]
+STRICT = 0.3  # share of the bounds in the search of an oracle
 CRAZYFLIE_LENGTH = 2.0  # factor on the bounds of Crazyflies
 LATER, LIMITED = 1.25, 0.05  # of a success: time over that of `oracle`, share of time with a rotor at its limit
 ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
@@ -56,18 +59,22 @@ SEED, SETS, ROUNDS, WIDTH, FLIGHTS = 1007, 24, 40, 0.25, 24
 
 
 class Part(NamedTuple):
-    """Flights on one plant in one condition."""
+    """n flights on one plant."""
 
     config: Config
     scenarios: Sequence[Scenario]
-    bound: float  # [m]
-    condition: str
+    bounds: np.ndarray  # (n,) [m]
+    conditions: np.ndarray  # (n,) the name of each flight's
+
+    @property
+    def strict(self) -> Part:
+        """Those with smaller bounds, for the search of an oracle, which should hold more than bounds of others ask."""
+        return self.undisturbed._replace(bounds=STRICT * self.bounds)
 
     @property
     def undisturbed(self) -> Part:
         """The same flights as `oracle` flies them."""
-        calm = [dataclasses.replace(one, disturbance=type(one.disturbance)()) for one in self.scenarios]
-        return self._replace(scenarios=calm)
+        return self._replace(scenarios=[dataclasses.replace(one, disturbance=Disturbance()) for one in self.scenarios])
 
 
 class Measured(NamedTuple):
@@ -78,15 +85,22 @@ class Measured(NamedTuple):
     peak: np.ndarray  # largest |e_o| in the last third [m]
 
 
-def flights_of(track: str, condition: str, count: int) -> list[Part]:
-    """The flights of a search: `count` on each plant of a `track`; both conditions fly the same loads and goals."""
-    parts = []
-    for world in worlds_of(track, DRAW):
+def flights_of(track: str, condition: str, count: int, plants: int | None = None) -> list[Part]:
+    """The flights of a search: `count` on each plant of a `track`; both conditions fly the same loads and goals.
+
+    `plants`: this many of the track, evenly spaced; None: all.
+    """
+    worlds, parts = worlds_of(track, DRAW), []
+    for world in worlds if plants is None else worlds[:: len(worlds) // plants]:
         length = CRAZYFLIE_LENGTH if track == "crazyflie" else world.length
-        for number, name in enumerate(BOUNDS):
-            if condition in (name, "both"):
-                chosen = [dataclasses.replace(pair[number], seconds=SECONDS) for pair in world.scenarios[:count]]
-                parts.append(Part(world.config, chosen, BOUNDS[name] * length, name))
+        chosen = [
+            (dataclasses.replace(one, seconds=SECONDS), bound * length, name)
+            for number, (name, bound) in enumerate(BOUNDS.items())
+            if condition in (name, "both")
+            for one in [pair[number] for pair in world.scenarios[:count]]
+        ]
+        scenarios, bounds, names = zip(*chosen, strict=True)
+        parts.append(Part(world.config, scenarios, np.array(bounds), np.array(names)))
     return parts
 
 
@@ -117,6 +131,7 @@ TUNED: dict[str, Tuned] = {
     "crazyflie-lqg": Tuned(crazyflie_lqg.CrazyflieLqg.tuning, crazyflie_lqg.design, _with("design", "lqg")),
     "crazyflie-oracle": Tuned(crazyflie_oracle.CrazyflieOracle.tuning, _crazyflie_gains, _with("gains", "oracle")),
     "lqg": Tuned(lqg.Lqg.tuning, lqg.design, _with("design", "lqg")),
+    "lqg-team": Tuned(lqg.Lqg.team_tuning, lqg.design, _with("design", "lqg")),
     "oracle": Tuned(
         oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning, (1.0,))[0], _with("gains", "oracle")
     ),
@@ -146,7 +161,7 @@ class Flown:
                 carry, (last, limited, peak), number = carried
                 carry, row = control_step(loop, controller, privileged, load, carry, now, np.float32(0.0))
                 far = jnp.sqrt(((row.target - row.position) ** 2).sum(axis=-1))
-                inside = (far <= part.bound) & ~row.diverged
+                inside = (far <= jnp.asarray(part.bounds, jnp.float32)) & ~row.diverged
                 near = near_limit(AT_LIMIT_WITHIN, row.rotor_force, most[..., None]).max(axis=(-2, -1))
                 last = jnp.where(inside, last, number + 1.0)
                 late = jnp.where(number >= 2 * total // 3, jnp.where(row.diverged, jnp.inf, far), 0.0)
@@ -185,25 +200,28 @@ class Search:
 
     def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: ProcessPoolExecutor | None = None):
         self.tuned, self._name, self._parts, self._log, self._pool = TUNED[name], name, parts, log, pool
-        self._flown = [Flown(name, part.undisturbed if name in ORACLES else part) for part in parts]
-        self._known = [None if name in ORACLES else known(part) for part in parts]
+        self._threads = ThreadPoolExecutor(len(parts))  # which compile and fly all plants at once
+        self._flown = [Flown(name, part.strict if name in ORACLES else part) for part in parts]
+        self._known = [None] * len(parts) if name in ORACLES else list(self._threads.map(known, parts))
         self._begun = time.perf_counter()
 
     def __call__(self, sets: np.ndarray) -> np.ndarray:
         """(S,) costs of `sets` (S, k), values of what is `searched`."""
         tunings = [tuned(self.tuned.start, values) for values in sets]
-        found = [
-            parts_of_cost(flown(designs(self._name, part.config, tunings, self._pool)), known)
-            for flown, part, known in zip(self._flown, self._parts, self._known, strict=True)
-        ]
-        costs = np.mean([parts["cost"] for parts in found], axis=0)
+        arrays = [designs(self._name, part.config, tunings, self._pool) for part in self._parts]
+        flown = self._threads.map(lambda fly, own: fly(own), self._flown, arrays)
+        numbers = [numbers_of(*both) for both in zip(flown, self._known, strict=True)]
+        of_flights = {name: np.concatenate([one[name] for one in numbers], axis=1) for name in numbers[0]}
+        conditions = np.concatenate([part.conditions for part in self._parts])
+        parts = {
+            name: {key: values[:, conditions == name] for key, values in of_flights.items()}
+            for name in dict.fromkeys(conditions)
+        }
         for number, tuning in enumerate(tunings):
-            parts = [
-                {"condition": part.condition, **{key: round(float(values[number]), 4) for key, values in own.items()}}
-                for part, own in zip(self._parts, found, strict=True)
-            ]
-            self._write({"cost": round(float(costs[number]), 4), "tuning": tuning._asdict(), "parts": parts})
-        return costs
+            record = {name: summary({k: v[number] for k, v in own.items()}) for name, own in parts.items()}
+            cost = round(float(of_flights["cost"][number].mean()), 4)
+            self._write({"cost": cost, "tuning": tuning._asdict(), **record})
+        return np.asarray(of_flights["cost"].mean(axis=1))
 
     def _write(self, record: dict[str, Any]) -> None:
         if self._log:
@@ -218,23 +236,28 @@ def known(part: Part) -> Measured:
     return Flown(name, part.undisturbed)(designs(name, part.config, [TUNED[name].start], None))
 
 
-def parts_of_cost(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
-    """(S,) each: the cost, the mean time [s] or ratio, the share of successes, of time at limits, the 90 % peak [m]."""
-    late = np.minimum(measured.time, SECONDS)
-    limited = measured.limited > LIMITED
+def numbers_of(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
+    """(S, n) each: cost, time [s], success (0, 1), share of time at limits and peak [m] of every flight."""
+    late, limited = np.minimum(measured.time, SECONDS), measured.limited > LIMITED
     if known is None:
         succeeds, ratio = np.isfinite(measured.time) & ~limited, late
     else:
         succeeds = (measured.time <= LATER * known.time) & ~limited
         ratio = np.minimum(late / np.minimum(known.time, SECONDS), WORST)
     return {
-        "cost": ratio.mean(axis=1) + (1.0 - succeeds.mean(axis=1)),
-        "time": ratio.mean(axis=1),
-        "median": np.median(late, axis=1),
-        "succeeded": succeeds.mean(axis=1),
-        "limited": measured.limited.mean(axis=1),
-        "peak_90": np.quantile(measured.peak, 0.9, axis=1),
+        "cost": ratio + 1.0 - succeeds,
+        "time": late,
+        "succeeded": succeeds.astype(float),
+        "limited": measured.limited,
+        "peak": measured.peak,
     }
+
+
+def summary(numbers: dict[str, np.ndarray]) -> dict[str, float]:
+    """One line of numbers (n,) of flights: means, the median time, the 90 % peak."""
+    found = {name: numbers[name].mean() for name in ("cost", "succeeded", "limited")}
+    found |= {"median": np.median(numbers["time"]), "peak_90": np.quantile(numbers["peak"], 0.9)}
+    return {name: round(float(value), 4) for name, value in found.items()}
 
 
 def searched(tuning: Any) -> list[str]:
@@ -261,7 +284,7 @@ def minimise(
     damping = 1 + 2 * max(0.0, math.sqrt((mu - 1) / (k + 1)) - 1) + c_width
     length = math.sqrt(k) * (1 - 1 / (4 * k) + 1 / (21 * k * k))
     mean, covariance, path, width_path = start.copy(), np.eye(k), np.zeros(k), np.zeros(k)
-    best, least = start, math.inf
+    best, least, begun = start, math.inf, time.perf_counter()
     for number in range(rounds):
         values, axes = np.linalg.eigh(covariance)
         root = axes * np.sqrt(np.maximum(values, 1e-20))
@@ -279,7 +302,11 @@ def minimise(
         covariance = (1 - c_one - c_mu) * covariance + c_one * np.outer(path, path)
         covariance += c_mu * (chosen.T * weights) @ chosen
         width *= math.exp(c_width / damping * (np.linalg.norm(width_path) / length - 1))
-        print(f"round {number + 1}: {least:.3f} median {np.median(found):.3f} width {width:.3f}", flush=True)
+        seconds = time.perf_counter() - begun
+        print(
+            f"{seconds:.0f} s, round {number + 1}: {least:.3f} median {np.median(found):.3f} width {width:.3f}",
+            flush=True,
+        )
     return best, least
 
 
@@ -290,6 +317,7 @@ def main() -> None:
     parser.add_argument("--track", default="pair", help="whose plants and loads fly")
     parser.add_argument("--condition", choices=(*BOUNDS, "both"), default="both")
     parser.add_argument("--flights", type=int, default=FLIGHTS, help="of each plant")
+    parser.add_argument("--plants", type=int, help="of the track; all if not given")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--sets", type=int, default=SETS, help="in each round")
     parser.add_argument("--width", type=float, default=WIDTH, help="of the first steps, in the logarithm")
@@ -297,8 +325,12 @@ def main() -> None:
     parser.add_argument("--log", type=Path, metavar="FILE", help="JSON lines, added to")
     options = parser.parse_args()
     enable_compilation_cache()
-    with ProcessPoolExecutor(options.cores) if options.cores > 1 else contextlib.nullcontext() as pool:
-        parts = flights_of(options.track, options.condition, options.flights)
+    with (
+        ProcessPoolExecutor(options.cores, multiprocessing.get_context("spawn"))
+        if options.cores > 1
+        else contextlib.nullcontext() as pool
+    ):
+        parts = flights_of(options.track, options.condition, options.flights, options.plants)
         search = Search(options.controller, parts, options.log, pool)
         start = np.log([getattr(search.tuned.start, name) for name in searched(search.tuned.start)])
         best, least = minimise(lambda sets: search(np.exp(sets)), start, options.width, options.sets, options.rounds)

@@ -60,43 +60,43 @@ ROLLING = 5 / 7  # acceleration of a rolling ball over that of a sliding one
 class Costs(NamedTuple):
     """Values with a cost of 1, and the largest error that the feedback acts on."""
 
-    y: float = 0.1  # of O [m]
-    vy: float = 0.5  # [m/s]
-    height: float = 0.1  # [m]
-    climb: float = 0.5  # [m/s]
-    rate: float = 3.0  # [rad/s]
-    thrust_difference: float = 0.05  # [N]
-    roll_change: float = 2.0  # of the roll command [rad/s]
-    vertical_change: float = 20.0  # of the vertical acceleration [m/s3]
-    error_limit: float = 0.1  # the motors have little thrust to spare [m]
+    y: float = 0.0158  # of O [m]
+    vy: float = 0.995  # [m/s]
+    height: float = 0.0738  # [m]
+    climb: float = 0.167  # [m/s]
+    rate: float = 0.183  # [rad/s]
+    thrust_difference: float = 0.292  # [N]
+    roll_change: float = 1.19  # of the roll command [rad/s]
+    vertical_change: float = 54.7  # of the vertical acceleration [m/s3]
+    error_limit: float = 0.112  # the motors have little thrust to spare [m]
 
 
 class Tuning(NamedTuple):
     """Parameters of the controller: those of `Costs`, then walks as standard deviations after a second, and others."""
 
-    y: float = 0.1
-    vy: float = 0.5
-    height: float = 0.1
-    climb: float = 0.5
-    rate: float = 3.0
-    thrust_difference: float = 0.05
-    roll_change: float = 2.0
-    vertical_change: float = 20.0
-    error_limit: float = 0.1
-    load_rate_walk: float = 0.2
-    load_walk: float = 1e-3
-    lift_walk: float = 0.02
-    wind_walk: float = 0.1
-    rate_walk: float = 0.1
-    velocity_walk: float = 0.1
-    load_rate_time: float = 1.0  # time constants with which disturbances decay [s]
-    load_time: float = 50.0
-    lift_time: float = 50.0
-    wind_time: float = 50.0
-    velocity_noise: float = 2e-2  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
-    angle_noise: float = 5e-3  # [rad]
-    rate_noise: float = 2e-2  # [rad/s]
-    delay: float = 3.0  # of the measurements, rounded [control steps]
+    y: float = 0.0859
+    vy: float = 0.878
+    height: float = 0.16
+    climb: float = 0.419
+    rate: float = 4.33
+    thrust_difference: float = 0.152
+    roll_change: float = 2.71
+    vertical_change: float = 43.1
+    error_limit: float = 0.121
+    load_rate_walk: float = 0.202
+    load_walk: float = 0.00182
+    lift_walk: float = 0.0118
+    wind_walk: float = 0.118
+    rate_walk: float = 0.084
+    velocity_walk: float = 0.0843
+    load_rate_time: float = 2.02  # time constants with which disturbances decay [s]
+    load_time: float = 32
+    lift_time: float = 33
+    wind_time: float = 30.5
+    velocity_noise: float = 0.0325  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 0.00877  # [rad]
+    rate_noise: float = 0.0322  # [rad/s]
+    delay: float = 3.6  # of the measurements, rounded [control steps]
 
     @property
     def costs(self) -> Costs:

@@ -31,7 +31,7 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import regulator, riccati, times
-from mjxball.baselines.sharing import Assumed, Sharing, Wanted, level
+from mjxball.baselines.sharing import Assumed, Wanted, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 
@@ -70,6 +70,7 @@ class Tuning(NamedTuple):
     climb_limit: float = 4.59
     load_walk: float = 639  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
     load_frequency: float = 1.14  # of the load's oscillation [rad/s]
+    load_damping: float = 0.05  # of that oscillation
     load_time: float = 21  # time constant with which its torque is forgotten [s]
     wind_walk: float = 0.129  # noise intensity of the wind's acceleration [(m/s2)2/s]
     wind_time: float = 51.1  # time constant with which it is forgotten [s]
@@ -91,12 +92,40 @@ class Tuning(NamedTuple):
     @property
     def load(self) -> LoadModel:
         """That of the disturbances."""
-        return LoadModel(self.load_frequency, self.load_time, self.wind_time, self.lift_time)
+        return LoadModel(self.load_frequency, self.load_damping, self.load_time, self.wind_time, self.lift_time)
 
     @property
     def late(self) -> int:
         """Delay in control steps."""
         return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
+
+
+# Of several followers, whose sensors and noises disagree: what each of them estimates must be forgotten.
+TEAM = Tuning(
+    position=0.0105,
+    velocity=0.175,
+    height=0.0194,
+    climb=0.853,
+    error_limit=0.168,
+    tilt_limit=0.885,
+    height_limit=0.204,
+    climb_limit=4.06,
+    load_walk=499,
+    load_frequency=4.55,
+    load_damping=0.436,
+    load_time=1.2,
+    wind_walk=0.00312,
+    wind_time=2.58,
+    lift_walk=0.00437,
+    lift_time=13.5,
+    acceleration_walk=0.00389,
+    turn_walk=0.374,
+    velocity_noise=0.0176,
+    angle_noise=0.00244,
+    rate_noise=0.0414,
+    loop_scale=1.1,
+    delay=1.9,
+)
 
 
 class Feedback(NamedTuple):
@@ -108,13 +137,23 @@ class Feedback(NamedTuple):
     error_limit: Float[Array, "... 3"]  # [m]
     limit: Float[Array, "... 3"]  # [rad], [rad], [m/s2]
 
-    def wanted(self, values: Array) -> Wanted:
-        """What all drones should do for `values` (..., 14) of `rows`."""
+    def wanted(self, values: Array, stiffness: Array | None = None) -> Wanted:
+        """What all drones should do for `values` (..., 14) of `rows`.
+
+        `stiffness` (...) of the attitude loops over that which the limits are for. A stiffer leader saturates its
+        rotors sooner against a tilt that it does not command: errors may then ask for less beside its command.
+        """
         xp = values.__array_namespace__()
         gain, most, limit = (xp.asarray(part, dtype=values.dtype) for part in self[1:])
         far = times(gain, xp.clip(values[..., :3], -most, most)) + values[..., 3:6]
-        command = xp.clip(far, -limit, limit) + values[..., 6:9]
-        return Wanted(command, values[..., 9:12], values[..., 12:14])
+        led = values[..., 9:12]
+        middle = 0.0 * led
+        if stiffness is not None:
+            share = 1.0 / xp.maximum(stiffness, 1.0 + 0.0 * stiffness)[..., None]
+            limit = xp.concat([share * limit[..., :2], limit[..., 2:] + 0.0 * share], axis=-1)
+            middle = xp.concat([(1.0 - share) * led[..., :2], middle[..., 2:]], axis=-1)
+        command = xp.clip(far, middle - limit, middle + limit) + values[..., 6:9]
+        return Wanted(command, led, values[..., 12:14])
 
 
 def balance(model: HoverModel, gravity: float) -> np.ndarray:
@@ -155,6 +194,7 @@ class LqgDesign(NamedTuple):
     ahead: Float[Array, "... 14 12"]  # and what the inputs since then add, the newest first
     sent: Float[Array, "... 5"]  # 1 for the input of that time, of the one now and the last four
     delay: Float[Array, "..."]  # control steps
+    loop_scale: Float[Array, "..."]  # assumed factor on the attitude loops' frequency
 
 
 def design(config: Config, tuning: Tuning) -> LqgDesign:
@@ -178,6 +218,7 @@ def design(config: Config, tuning: Tuning) -> LqgDesign:
         ahead=ahead,
         sent=np.eye(LONGEST_DELAY + 1)[tuning.late],
         delay=np.array(float(tuning.late)),
+        loop_scale=np.array(float(tuning.loop_scale)),
     )
 
 
@@ -203,12 +244,13 @@ class Lqg:
 
     name = "lqg"
     needs_privileged = False
-    tuning = Tuning()
+    tuning, team_tuning = Tuning(), TEAM
 
     def __init__(self, config: Config, tuning: Tuning | None = None):
         self._model = ideal_model(config, self.name)
-        self._sharing = Sharing(config, self._model)
-        self.design = design(config, tuning or self.tuning)
+        self._sharing = sharing(config, self._model)
+        own = self.team_tuning if config.plant.is_team else self.tuning
+        self.design = design(config, tuning or own)
         self._over_inertia = np.linalg.inv(hover_model(config, self._model, LoadModel()).inertia)
 
     def start(self, observation: Array) -> LqgState:
@@ -227,7 +269,9 @@ class Lqg:
         x = state.expected + times(own.gain, y - times(own.measured, state.expected))
         carried = model.carried(privileged.believed_mass)
         wanted = own.feedback.wanted(times(own.feedback.rows, x) + times(own.ahead, state.given))
-        commands, asked = self._sharing(wanted, Assumed(carried, carried.sum(axis=-1), level(seen)))
+        commands, asked = self._sharing(
+            wanted, Assumed(carried, carried.sum(axis=-1), level(seen), None, xp.asarray(own.loop_scale, dtype=x.dtype))
+        )
         asked = xp.concat([times(self._over_inertia, asked[..., :2]), asked[..., 2:]], axis=-1)
         given = xp.concat([asked, state.given], axis=-1)
         sent, late = (xp.asarray(part, dtype=x.dtype) for part in (own.sent, own.delay))
