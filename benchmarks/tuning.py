@@ -15,7 +15,6 @@ line of JSON each: its tuning, its cost, and the cost's parts.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import copy
 import dataclasses
 import functools
@@ -24,7 +23,7 @@ import math
 import multiprocessing
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,25 +31,25 @@ import jax
 import numpy as np
 from jax import numpy as jnp
 
-from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_controller, oracle
+from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_controller, mpc, oracle
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.pid import Pid
 from mjxball.bench.tracks import worlds_of
 from mjxball.config import Config
-from mjxball.control.followers import Controller
+from mjxball.control.followers import Baseline, Controller
 from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, near_limit, rotor_limits
 from mjxball.physics import newton_euler
 from mjxball.physics.step import jax_repeat, make_plant_step
 from mjxball.scalar_form import scalar_form
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays
+from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
 DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
 BOUNDS = {"calm": 0.01, "rough": 0.02}  # [m]
-STRICT = 0.3  # share of the bounds in the search of an oracle
+STRICT = (0.3, 0.6)  # share of the bounds in the search of an oracle, of ideal loops and of Crazyflies
 CRAZYFLIE_LENGTH = 2.0  # factor on the bounds of Crazyflies
 LATER, LIMITED = 1.25, 0.05  # of a success: time over that of `oracle`, share of time with a rotor at its limit
 ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
@@ -69,7 +68,8 @@ class Part(NamedTuple):
     @property
     def strict(self) -> Part:
         """Those with smaller bounds, for the search of an oracle, which should hold more than bounds of others ask."""
-        return self.undisturbed._replace(bounds=STRICT * self.bounds)
+        share = STRICT[self.config.autopilot.kind == "crazyflie"]
+        return self.undisturbed._replace(bounds=share * self.bounds)
 
     @property
     def undisturbed(self) -> Part:
@@ -108,8 +108,8 @@ class Tuned(NamedTuple):
     """How a controller takes many tunings at once."""
 
     start: Any  # the tuning that it has, a tuple of numbers by name
-    arrays: Callable[[Config, Any], Any]  # what a tuning becomes, a tree of arrays
-    make: Callable[[Config, Any], Controller]  # the controller of such a tree of traced arrays
+    arrays: Callable[[Config, Any], Any] | None  # what a tuning becomes, a tree of arrays; None: no compiled program
+    make: Callable[[Config, Any], Controller]  # the controller of such a tree of traced arrays, or of a tuning
 
 
 def _with(attribute: str, name: str) -> Callable[[Config, Any], Controller]:
@@ -135,6 +135,7 @@ TUNED: dict[str, Tuned] = {
     "oracle": Tuned(
         oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning, (1.0,))[0], _with("gains", "oracle")
     ),
+    "mpc": Tuned(mpc.Mpc.tuning, None, mpc.Mpc),
     "pid": Tuned(Pid.gains, lambda config, gains: gains, _with("gains", "pid")),
     "observer": Tuned(Observer.gains, lambda config, gains: gains, _with("gains", "observer")),
 }
@@ -184,32 +185,53 @@ class Flown:
         return Measured(np.maximum(seconds, self._period), limited, peak)
 
 
-def designs(name: str, config: Config, sets: Sequence[Any], pool: ProcessPoolExecutor | None) -> Any:
-    """The arrays of all `sets`, stacked, in float32."""
-    function = functools.partial(_design, name, config)
-    found = list(pool.map(function, sets) if pool else map(function, sets))
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *found)
+def fly_all(name: str, part: Part, tunings: Sequence[Any], flown: Flown | None, pool: Executor) -> Measured:
+    """What all `tunings` do in the flights of `part`; `flown` is None where there is no compiled program."""
+    if flown is None:
+        each = pool.map(functools.partial(_simulate, name, part), tunings)
+        return Measured(*(np.stack(column) for column in zip(*each, strict=True)))
+    found = list(pool.map(functools.partial(_design, name, part.config), tunings))
+    return flown(jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *found))
 
 
 def _design(name: str, config: Config, tuning: Any) -> Any:
-    return TUNED[name].arrays(config, tuning)
+    arrays = TUNED[name].arrays
+    assert arrays is not None
+    return arrays(config, tuning)
+
+
+def _simulate(name: str, part: Part, tuning: Any) -> Measured:
+    """(n,) each: the flights of one tuning, in NumPy."""
+    config = part.config
+    follower = Baseline(TUNED[name].make(config, tuning), config)
+    flight = simulate_batch(config, [(follower, part.scenarios)], "newton-euler")
+    far = np.where(flight.diverged, np.inf, np.linalg.norm(flight.error, axis=-1))
+    most = rotor_limits(config.plant, part.scenarios)[..., None]
+    near = near_limit(AT_LIMIT_WITHIN, flight.rotor_force, most).max(axis=(-2, -1))
+    outside, rows = ~(far <= part.bounds), np.arange(1, len(far) + 1)[:, None]
+    last = (outside * rows).max(axis=0)
+    seconds = np.where(last == len(far), np.inf, np.maximum(last, 1) * config.timing.control_period)
+    return Measured(seconds, near.mean(axis=0), far[2 * len(far) // 3 :].max(axis=0))
 
 
 class Search:
     """The cost of sets of one controller on all parts, and its log."""
 
-    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: ProcessPoolExecutor | None = None):
-        self.tuned, self._name, self._parts, self._log, self._pool = TUNED[name], name, parts, log, pool
+    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: Executor):
+        self.tuned, self._name, self._log, self._pool = TUNED[name], name, log, pool
         self._threads = ThreadPoolExecutor(len(parts))  # which compile and fly all plants at once
-        self._flown = [Flown(name, part.strict if name in ORACLES else part) for part in parts]
+        self._parts = [part.strict if name in ORACLES else part for part in parts]
+        compiled = self.tuned.arrays is not None
+        self._flown = [Flown(name, part) if compiled else None for part in self._parts]
         self._known = [None] * len(parts) if name in ORACLES else list(self._threads.map(known, parts))
         self._begun = time.perf_counter()
 
     def __call__(self, sets: np.ndarray) -> np.ndarray:
         """(S,) costs of `sets` (S, k), values of what is `searched`."""
         tunings = [tuned(self.tuned.start, values) for values in sets]
-        arrays = [designs(self._name, part.config, tunings, self._pool) for part in self._parts]
-        flown = self._threads.map(lambda fly, own: fly(own), self._flown, arrays)
+        flown = self._threads.map(
+            lambda part, fly: fly_all(self._name, part, tunings, fly, self._pool), self._parts, self._flown
+        )
         numbers = [numbers_of(*both) for both in zip(flown, self._known, strict=True)]
         of_flights = {name: np.concatenate([one[name] for one in numbers], axis=1) for name in numbers[0]}
         conditions = np.concatenate([part.conditions for part in self._parts])
@@ -233,7 +255,8 @@ class Search:
 def known(part: Part) -> Measured:
     """The flights of `oracle`."""
     name = ORACLES[part.config.autopilot.kind == "crazyflie"]
-    return Flown(name, part.undisturbed)(designs(name, part.config, [TUNED[name].start], None))
+    with ThreadPoolExecutor(1) as alone:
+        return fly_all(name, part.undisturbed, [TUNED[name].start], Flown(name, part.undisturbed), alone)
 
 
 def numbers_of(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
@@ -321,14 +344,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--sets", type=int, default=SETS, help="in each round")
     parser.add_argument("--width", type=float, default=WIDTH, help="of the first steps, in the logarithm")
-    parser.add_argument("--cores", type=int, default=1, help="processes that solve the Riccati equations")
+    parser.add_argument("--cores", type=int, default=1, help="processes that compute designs, and that fly `mpc`")
     parser.add_argument("--log", type=Path, metavar="FILE", help="JSON lines, added to")
     options = parser.parse_args()
     enable_compilation_cache()
     with (
         ProcessPoolExecutor(options.cores, multiprocessing.get_context("spawn"))
         if options.cores > 1
-        else contextlib.nullcontext() as pool
+        else ThreadPoolExecutor(1) as pool
     ):
         parts = flights_of(options.track, options.condition, options.flights, options.plants)
         search = Search(options.controller, parts, options.log, pool)

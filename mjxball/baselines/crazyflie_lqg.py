@@ -60,15 +60,15 @@ ROLLING = 5 / 7  # acceleration of a rolling ball over that of a sliding one
 class Costs(NamedTuple):
     """Values with a cost of 1, and the largest error that the feedback acts on."""
 
-    y: float = 0.0158  # of O [m]
-    vy: float = 0.995  # [m/s]
-    height: float = 0.0738  # [m]
-    climb: float = 0.167  # [m/s]
-    rate: float = 0.183  # [rad/s]
-    thrust_difference: float = 0.292  # [N]
-    roll_change: float = 1.19  # of the roll command [rad/s]
-    vertical_change: float = 54.7  # of the vertical acceleration [m/s3]
-    error_limit: float = 0.112  # the motors have little thrust to spare [m]
+    y: float = 0.0231  # of O [m]
+    vy: float = 0.427  # [m/s]
+    height: float = 0.0133  # [m]
+    climb: float = 0.246  # [m/s]
+    rate: float = 8.26  # [rad/s]
+    thrust_difference: float = 0.0714  # [N]
+    roll_change: float = 0.381  # of the roll command [rad/s]
+    vertical_change: float = 0.488  # of the vertical acceleration [m/s3]
+    error_limit: float = 0.116  # the motors have little thrust to spare [m]
 
 
 class Tuning(NamedTuple):

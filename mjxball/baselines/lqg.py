@@ -165,14 +165,19 @@ def balance(model: HoverModel, gravity: float) -> np.ndarray:
     return found
 
 
-def feedback(model: HoverModel, costs: Costs, gravity: float) -> Feedback:
-    """The LQR of errors and rates of O and of the command's deviation from `balance`."""
-    drive, steady = model.drive @ model.commanded, balance(model, gravity)
+def regulated(model: HoverModel, costs: Costs, gravity: float) -> tuple[np.ndarray, np.ndarray]:
+    """(gains (3, 22) of the command's deviation from `balance`, cost (3, 3) of another deviation, see `regulator`)."""
+    drive = model.drive @ model.commanded
     outputs = np.vstack([model.error, model.error_rate])
     weights = np.array([costs.position] * 2 + [costs.height] + [costs.velocity] * 2 + [costs.climb]) ** -2.0
     deviation = np.diag([TILT_COST**-2, TILT_COST**-2, VERTICAL_COST**-2])
-    gains, _ = regulator(model.transition + drive @ steady, drive, outputs.T * weights @ outputs, deviation)
-    whole = steady - gains
+    transition = model.transition + drive @ balance(model, gravity)
+    return regulator(transition, drive, outputs.T * weights @ outputs, deviation)
+
+
+def feedback(model: HoverModel, costs: Costs, gravity: float) -> Feedback:
+    """The LQR of errors and rates of O and of the command's deviation from `balance`."""
+    whole = balance(model, gravity) - regulated(model, costs, gravity)[0]
     position, damping = whole[:, ERRORS], whole[:, RATES] @ model.error_rate
     rest = whole - position @ model.error - damping
     return Feedback(
@@ -206,13 +211,10 @@ def design(config: Config, tuning: Tuning) -> LqgDesign:
     ahead = np.zeros((ROWS, 3 * LONGEST_DELAY))
     for number in range(tuning.late):
         ahead[:, 3 * number : 3 * number + 3] = found.rows @ powers[number] @ model.drive
-    process, noise = noises(tuning, assembly.period)
-    predicted = riccati(transition.T, model.measured.T, process, noise)
-    innovation = model.measured @ predicted @ model.measured.T + noise
     return LqgDesign(
         transition=transition,
         drive=model.drive,
-        gain=np.linalg.solve(innovation, model.measured @ predicted).T,
+        gain=filter_gain(model, tuning, assembly.period),
         measured=model.measured,
         feedback=found._replace(rows=found.rows @ powers[-1]),
         ahead=ahead,
@@ -220,6 +222,14 @@ def design(config: Config, tuning: Tuning) -> LqgDesign:
         delay=np.array(float(tuning.late)),
         loop_scale=np.array(float(tuning.loop_scale)),
     )
+
+
+def filter_gain(model: HoverModel, tuning: Tuning, period: float) -> np.ndarray:
+    """(22, 10) K of the steady-state Kalman filter x <- x + K (y - C x), with the leader in the loop."""
+    process, noise = noises(tuning, period)
+    predicted = riccati(model.with_leader.T, model.measured.T, process, noise)
+    innovation = model.measured @ predicted @ model.measured.T + noise
+    return np.linalg.solve(innovation, model.measured @ predicted).T
 
 
 def noises(tuning: Tuning, period: float) -> tuple[np.ndarray, np.ndarray]:
