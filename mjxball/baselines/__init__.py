@@ -11,7 +11,7 @@ from collections.abc import Callable
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
 from mjxball.baselines.crazyflie_oracle import CrazyflieOracle
-from mjxball.baselines.lqg import Lqg
+from mjxball.baselines.lqg import CalmLqg, Lqg, WorldLqg
 from mjxball.baselines.mpc import Mpc
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.oracle import Oracle
@@ -26,8 +26,10 @@ __all__ = [
     "CONTROLLERS",
     "SUITE_BASELINES",
     "Adaptive",
+    "CalmLqg",
     "Copy",
     "CrazyflieLqg",
+    "CrazyflieOracle",
     "Lqg",
     "Mpc",
     "Observer",
@@ -35,6 +37,7 @@ __all__ = [
     "Pid",
     "Random",
     "Stay",
+    "WorldLqg",
     "make_baseline",
     "make_controller",
 ]
@@ -49,11 +52,13 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "pid": Pid,
     "observer": Observer,
     "lqg": lambda config: _of_kind(config, Lqg, CrazyflieLqg),
+    "lqg-calm": lambda config: _of_kind(config, CalmLqg, CrazyflieLqg),
+    "lqg-world": lambda config: _of_kind(config, WorldLqg, CrazyflieLqg),
     "mpc": Mpc,
 }
-# In benchmark suites. Without failures `lqg-known-failures` equals `lqg`; `mpc` needs an extra and is slow.
-SUITE_BASELINES = tuple(name for name in CONTROLLERS if name not in ("lqg-known-failures", "mpc"))
-VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
+# In benchmark suites. `mpc` needs an extra and is slow; `lqg-calm` and `lqg-world` are told the condition of a flight.
+SUITE_BASELINES = tuple(name for name in CONTROLLERS if name not in ("lqg-calm", "lqg-world", "mpc"))
+VARIANTS = ("adaptive-mass", "pid", "observer")
 BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # default followers of `eval.py`
 
 

@@ -47,42 +47,42 @@ ROWS = 14  # of `Feedback`
 class Costs(NamedTuple):
     """What the LQR weighs, and limits of what it acts on."""
 
-    position: float = 0.16  # horizontal error with a cost of 1 [m]
-    velocity: float = 0.5  # and its rate [m/s]
-    height: float = 0.2  # vertical error with a cost of 1 [m]
-    climb: float = 0.6  # and its rate [m/s]
-    error_limit: float = 0.9  # largest horizontal error that is acted on [m]
-    tilt_limit: float = 0.3  # largest tilt that errors and rates ask for [rad]
-    height_limit: float = 0.9  # largest vertical error that is acted on [m]
-    climb_limit: float = 2.5  # largest vertical acceleration that errors and rates ask for [m/s2]
+    position: float  # horizontal error with a cost of 1 [m]
+    velocity: float  # and its rate [m/s]
+    height: float  # vertical error with a cost of 1 [m]
+    climb: float  # and its rate [m/s]
+    error_limit: float  # largest horizontal error that is acted on [m]
+    tilt_limit: float  # largest tilt that errors and rates ask for [rad]
+    height_limit: float  # largest vertical error that is acted on [m]
+    climb_limit: float  # largest vertical acceleration that errors and rates ask for [m/s2]
 
 
 class Tuning(NamedTuple):
     """Parameters of the controller: those of `Costs`, and of the filter and its model."""
 
-    position: float = 0.079
-    velocity: float = 0.306
-    height: float = 0.0379
-    climb: float = 0.261
-    error_limit: float = 0.499
-    tilt_limit: float = 0.331
-    height_limit: float = 0.18
-    climb_limit: float = 4.59
-    load_walk: float = 639  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
-    load_frequency: float = 1.14  # of the load's oscillation [rad/s]
-    load_damping: float = 0.05  # of that oscillation
-    load_time: float = 21  # time constant with which its torque is forgotten [s]
-    wind_walk: float = 0.129  # noise intensity of the wind's acceleration [(m/s2)2/s]
-    wind_time: float = 51.1  # time constant with which it is forgotten [s]
-    lift_walk: float = 0.00539  # as of the wind, of errors of mass and thrust
-    lift_time: float = 87.3
-    acceleration_walk: float = 0.0144  # of every velocity [(m/s)2/s]
-    turn_walk: float = 0.0349  # of roll and pitch rate [(rad/s)2/s]
-    velocity_noise: float = 0.0292  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
-    angle_noise: float = 0.00194  # [rad]
-    rate_noise: float = 0.0166  # [rad/s]
-    loop_scale: float = 1.04  # assumed factor on the attitude loops' natural frequency
-    delay: float = 0.917  # of the measurements, rounded [control steps]
+    position: float = 0.0567
+    velocity: float = 0.294
+    height: float = 0.0497
+    climb: float = 0.256
+    error_limit: float = 0.425
+    tilt_limit: float = 0.379
+    height_limit: float = 0.205
+    climb_limit: float = 4.83
+    load_walk: float = 638  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
+    load_frequency: float = 1.05  # of the load's oscillation [rad/s]
+    load_damping: float = 0.0491  # of that oscillation
+    load_time: float = 31.4  # time constant with which its torque is forgotten [s]
+    wind_walk: float = 0.207  # noise intensity of the wind's acceleration [(m/s2)2/s]
+    wind_time: float = 56.5  # time constant with which it is forgotten [s]
+    lift_walk: float = 0.0112  # as of the wind, of errors of mass and thrust
+    lift_time: float = 70.2
+    acceleration_walk: float = 0.0129  # of every velocity [(m/s)2/s]
+    turn_walk: float = 0.0244  # of roll and pitch rate [(rad/s)2/s]
+    velocity_noise: float = 0.0283  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 0.0027  # [rad]
+    rate_noise: float = 0.022  # [rad/s]
+    loop_scale: float = 0.993  # assumed factor on the attitude loops' natural frequency
+    delay: float = 0.859  # of the measurements, rounded [control steps]
 
     @property
     def costs(self) -> Costs:
@@ -100,6 +100,8 @@ class Tuning(NamedTuple):
         return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
 
 
+CALM = Tuning()
+WORLD = Tuning()
 # Of several followers, whose sensors and noises disagree: what each of them estimates must be forgotten.
 TEAM = Tuning(
     position=0.0105,
@@ -290,3 +292,17 @@ class Lqg:
         # The first measurements are of the start, where nothing moves.
         expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
         return LqgState(expected, given[..., :-3], state.steps + 1.0), model.own(commands)
+
+
+class CalmLqg(Lqg):
+    """`lqg` for flights that are known to be without noise and delay."""
+
+    name = "lqg-calm"
+    tuning = CALM
+
+
+class WorldLqg(Lqg):
+    """`lqg` for flights that are known to be with noise and delay."""
+
+    name = "lqg-world"
+    tuning = WORLD

@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_are
 
 from mjxball.baselines import crazyflie_lqg, linear, make_baseline, make_controller
 from mjxball.baselines.assembly_model import assembly_model
-from mjxball.baselines.crazyflie_lqg import linear_model
+from mjxball.baselines.crazyflie_model import Decay, linear_model
 from mjxball.config import apply_overrides, preset, replace
 from mjxball.control import crazyflie
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -73,7 +73,7 @@ def test_thrust_per_acceleration() -> None:
 
 
 def test_ball_on_the_stand_turns_with_five_sevenths_of_gravity() -> None:
-    model = linear_model(STAND, crazyflie_lqg.Tuning())
+    model = linear_model(STAND, Decay())
     assert "y" not in model.names
     row, column = model.names.index("load_rate"), model.names.index("roll")
     assert model.a[row, column] == pytest.approx(5 / 7 * 0.0075 * 9.81**2)
@@ -82,7 +82,7 @@ def test_ball_on_the_stand_turns_with_five_sevenths_of_gravity() -> None:
 @pytest.mark.parametrize("command", [(0.05, 0.0), (0.0, 0.3)], ids=["roll", "vertical"])
 def test_model_moves_as_the_simulator(command: tuple[float, float]) -> None:
     """A command stepped from hover, for 0.3 s: the model without delay against the full physics."""
-    config, model = FLIGHT, linear_model(FLIGHT, crazyflie_lqg.Tuning())
+    config, model = FLIGHT, linear_model(FLIGHT, Decay())
     scenario = Scenario(mass=0.0175, amplitude=0.0, goal=(0.0, 0.0, 0.0), seconds=1.0)
     state, load = start_of(config, [scenario]), load_of(config, [scenario])
     step = make_numpy_plant_step(config, "newton-euler")
