@@ -2,13 +2,10 @@
 
 Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
 delay as in training (settings of the preset `universal`). The object's mass stays what it is; with --mass-step it
-changes once in a flight, as in training, and the LQGs know it at once. `lqg-known-rig` and `lqg-slow-known-rig` know
-the rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque
-alone.
-The better of both is the reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met
-where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
-0.17 m where that is larger, above the reference's, or where the reference itself has none. The two LQGs are held to the
-same bar.
+changes once in a flight, as in training. `lqg` knows the rig's masses, inertia, mounts, loops and rotors; it is the
+reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met where the policy's median
+settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over 0.17 m where that is
+larger, above the reference's, or where the reference itself has none.
 
 With --seed 77 the rigs are others than those held out: to choose among policies.
 """
@@ -28,7 +25,7 @@ import numpy as np
 from bounds import Bound, limits, numbers
 from harness import Row, arguments, say, table, write
 from mjxball.baselines.adaptive import Adaptive
-from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
+from mjxball.baselines.lqg import Lqg
 from mjxball.bench.tracks import RIG_LENGTH
 from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Controller, Copy
@@ -45,7 +42,7 @@ from teams import effort_of
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
 LATER, MORE = 1.25, 0.005  # settling, peak [m] of a rig of the pair's length
 WANTED = {"peak": Bound(MORE), "settling": Bound(relative=LATER - 1)}
-KNOWING = ("lqg-known-rig", "lqg-slow-known-rig")
+KNOWING = ("lqg",)
 PAIR_LOAD = 0.2  # [kg]
 SHARES = ("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner")
 
@@ -53,10 +50,9 @@ Made = tuple[str, Callable[[Config, RigTable], Controller | list[Controller]]]
 
 
 def followers(paths: Sequence[Path]) -> list[Made]:
-    """(name, what makes its controller for rigs of one size), the two LQGs that know each rig first."""
+    """(name, what makes its controller for rigs of one size), the LQG that knows each rig first."""
     return [
-        ("lqg-known-rig", lambda config, rigs: rig_controllers(config, rigs, KnownRigLqg)),
-        ("lqg-slow-known-rig", lambda config, rigs: rig_controllers(config, rigs, SlowKnownRigLqg)),
+        ("lqg", lambda config, rigs: rig_controllers(config, rigs, Lqg)),
         ("copy", lambda config, rigs: Copy(config)),
         ("adaptive-mass", lambda config, rigs: rig_controllers(config, rigs, _adaptive)),
         *((path.stem, functools.partial(network, path)) for path in paths),
@@ -95,12 +91,10 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
             begun = time.perf_counter()
             flown[name] = fly_random_rigs(config, rigs, make(config, rigs), FLIGHTS)
             seconds = round(time.perf_counter() - begun, 1)
-            # Rows of the two LQGs are complete once both have flown.
-            for known in {KNOWING[0]: (), KNOWING[1]: KNOWING}.get(name, (name,)):
-                row = {"drones": size, "follower": known, **row_of(flown, known, rigs)}
-                whole.setdefault(known, []).append(row)
-                rows.append({**row, "seconds": seconds})
-                say(rows[-1], ".3g")
+            row = {"drones": size, "follower": name, **row_of(flown, name, rigs)}
+            whole.setdefault(name, []).append(row)
+            rows.append({**row, "seconds": seconds})
+            say(rows[-1], ".3g")
         rejected = {"drawn": sampled.candidates, "unstable": sampled.unstable, "untrimmed": sampled.untrimmed}
         rows.append({"drones": size, "rigs": options.rigs, **rejected})
     shares = {

@@ -7,23 +7,24 @@ CMA-ES (Hansen) over the logarithms of a controller's tuning; it starts from tha
 a round fly all flights as one compiled program, on the CPU or on a GPU; `mpc` solves its programs on the CPU, set by
 set. What is made small is the mean over flights of the time after which |e_o| stays within a bound, over that of
 `oracle` and at most four, plus the share of flights without success: later than 1.25 times `oracle`, or a rotor at its
-limit for more than 5 % of the time. Of `oracle` itself it is the mean of that time in seconds. Bounds are 10 mm calm
-and 20 mm otherwise, times the rig's length over the pair's where it is longer. Every set is written to the log, one
-line of JSON each: its tuning, its cost, and the cost's parts.
+limit for more than 5 % of the time. Bounds are 10 mm calm and 20 mm otherwise, times the rig's length over the pair's
+where it is longer, and twice as much for Crazyflies. Of an oracle it is the mean of that time in seconds, for these
+bounds and for three tenths of them. Every set is written to the log, one line of JSON each: its tuning, its cost, and
+the cost's parts.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import copy
 import dataclasses
 import functools
 import json
 import math
+import multiprocessing
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,43 +32,50 @@ import jax
 import numpy as np
 from jax import numpy as jnp
 
-from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_controller, oracle
+from cma import minimise
+from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_controller, mpc, oracle
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.pid import Pid
 from mjxball.bench.tracks import worlds_of
 from mjxball.config import Config
-from mjxball.control.followers import Controller
+from mjxball.control.followers import Baseline, Controller
 from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, near_limit, rotor_limits
 from mjxball.physics import newton_euler
 from mjxball.physics.step import jax_repeat, make_plant_step
 from mjxball.scalar_form import scalar_form
 from mjxball.sim.closed_loop import ClosedLoop
-from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
 DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
 BOUNDS = {"calm": 0.01, "rough": 0.02}  # [m]
+STRICT = 0.3  # share of the bounds within which an oracle is asked to stay, too
 CRAZYFLIE_LENGTH = 2.0  # factor on the bounds of Crazyflies
 LATER, LIMITED = 1.25, 0.05  # of a success: time over that of `oracle`, share of time with a rotor at its limit
 ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
 WORST = 4.0  # times that of `oracle` a flight counts at most
-SEED, SETS, ROUNDS, WIDTH, FLIGHTS = 1007, 24, 40, 0.25, 24
+SETS, ROUNDS, WIDTH, FLIGHTS = 24, 40, 0.25, 24
 
 
 class Part(NamedTuple):
-    """Flights on one plant in one condition."""
+    """n flights on one plant."""
 
     config: Config
     scenarios: Sequence[Scenario]
-    bound: float  # [m]
-    condition: str
+    bounds: np.ndarray  # (n,) [m]
+    conditions: np.ndarray  # (n,) the name of each flight's
+
+    @property
+    def strict(self) -> Part:
+        """Those with smaller bounds, for the search of an oracle."""
+        return self.undisturbed._replace(bounds=STRICT * self.bounds)
 
     @property
     def undisturbed(self) -> Part:
         """The same flights as `oracle` flies them."""
-        calm = [dataclasses.replace(one, disturbance=type(one.disturbance)()) for one in self.scenarios]
-        return self._replace(scenarios=calm)
+        return self._replace(scenarios=[dataclasses.replace(one, disturbance=Disturbance()) for one in self.scenarios])
 
 
 class Measured(NamedTuple):
@@ -78,15 +86,22 @@ class Measured(NamedTuple):
     peak: np.ndarray  # largest |e_o| in the last third [m]
 
 
-def flights_of(track: str, condition: str, count: int) -> list[Part]:
-    """The flights of a search: `count` on each plant of a `track`; both conditions fly the same loads and goals."""
-    parts = []
-    for world in worlds_of(track, DRAW):
+def flights_of(track: str, condition: str, count: int, plants: int | None = None) -> list[Part]:
+    """The flights of a search: `count` on each plant of a `track`; both conditions fly the same loads and goals.
+
+    `plants`: this many of the track, evenly spaced; None: all.
+    """
+    worlds, parts = worlds_of(track, DRAW), []
+    for world in worlds if plants is None else worlds[:: len(worlds) // plants]:
         length = CRAZYFLIE_LENGTH if track == "crazyflie" else world.length
-        for number, name in enumerate(BOUNDS):
-            if condition in (name, "both"):
-                chosen = [dataclasses.replace(pair[number], seconds=SECONDS) for pair in world.scenarios[:count]]
-                parts.append(Part(world.config, chosen, BOUNDS[name] * length, name))
+        chosen = [
+            (dataclasses.replace(one, seconds=SECONDS), bound * length, name)
+            for number, (name, bound) in enumerate(BOUNDS.items())
+            if condition in (name, "both")
+            for one in [pair[number] for pair in world.scenarios[:count]]
+        ]
+        scenarios, bounds, names = zip(*chosen, strict=True)
+        parts.append(Part(world.config, scenarios, np.array(bounds), np.array(names)))
     return parts
 
 
@@ -94,8 +109,8 @@ class Tuned(NamedTuple):
     """How a controller takes many tunings at once."""
 
     start: Any  # the tuning that it has, a tuple of numbers by name
-    arrays: Callable[[Config, Any], Any]  # what a tuning becomes, a tree of arrays
-    make: Callable[[Config, Any], Controller]  # the controller of such a tree of traced arrays
+    arrays: Callable[[Config, Any], Any] | None  # what a tuning becomes, a tree of arrays; None: no compiled program
+    make: Callable[[Config, Any], Controller]  # the controller of such a tree of traced arrays, or of a tuning
 
 
 def _with(attribute: str, name: str) -> Callable[[Config, Any], Controller]:
@@ -117,9 +132,11 @@ TUNED: dict[str, Tuned] = {
     "crazyflie-lqg": Tuned(crazyflie_lqg.CrazyflieLqg.tuning, crazyflie_lqg.design, _with("design", "lqg")),
     "crazyflie-oracle": Tuned(crazyflie_oracle.CrazyflieOracle.tuning, _crazyflie_gains, _with("gains", "oracle")),
     "lqg": Tuned(lqg.Lqg.tuning, lqg.design, _with("design", "lqg")),
+    "lqg-team": Tuned(lqg.Lqg.team_tuning, lqg.design, _with("design", "lqg")),
     "oracle": Tuned(
         oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning, (1.0,))[0], _with("gains", "oracle")
     ),
+    "mpc": Tuned(mpc.Mpc.tuning, None, mpc.Mpc),
     "pid": Tuned(Pid.gains, lambda config, gains: gains, _with("gains", "pid")),
     "observer": Tuned(Observer.gains, lambda config, gains: gains, _with("gains", "observer")),
 }
@@ -146,7 +163,7 @@ class Flown:
                 carry, (last, limited, peak), number = carried
                 carry, row = control_step(loop, controller, privileged, load, carry, now, np.float32(0.0))
                 far = jnp.sqrt(((row.target - row.position) ** 2).sum(axis=-1))
-                inside = (far <= part.bound) & ~row.diverged
+                inside = (far <= jnp.asarray(part.bounds, jnp.float32)) & ~row.diverged
                 near = near_limit(AT_LIMIT_WITHIN, row.rotor_force, most[..., None]).max(axis=(-2, -1))
                 last = jnp.where(inside, last, number + 1.0)
                 late = jnp.where(number >= 2 * total // 3, jnp.where(row.diverged, jnp.inf, far), 0.0)
@@ -169,41 +186,66 @@ class Flown:
         return Measured(np.maximum(seconds, self._period), limited, peak)
 
 
-def designs(name: str, config: Config, sets: Sequence[Any], pool: ProcessPoolExecutor | None) -> Any:
-    """The arrays of all `sets`, stacked, in float32."""
-    function = functools.partial(_design, name, config)
-    found = list(pool.map(function, sets) if pool else map(function, sets))
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *found)
+def fly_all(name: str, part: Part, tunings: Sequence[Any], flown: Flown | None, pool: Executor) -> Measured:
+    """What all `tunings` do in the flights of `part`; `flown` is None where there is no compiled program."""
+    if flown is None:
+        each = pool.map(functools.partial(_simulate, name, part), tunings)
+        return Measured(*(np.stack(column) for column in zip(*each, strict=True)))
+    found = list(pool.map(functools.partial(_design, name, part.config), tunings))
+    return flown(jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *found))
 
 
 def _design(name: str, config: Config, tuning: Any) -> Any:
-    return TUNED[name].arrays(config, tuning)
+    arrays = TUNED[name].arrays
+    assert arrays is not None
+    return arrays(config, tuning)
+
+
+def _simulate(name: str, part: Part, tuning: Any) -> Measured:
+    """(n,) each: the flights of one tuning, in NumPy."""
+    config = part.config
+    follower = Baseline(TUNED[name].make(config, tuning), config)
+    flight = simulate_batch(config, [(follower, part.scenarios)], "newton-euler")
+    far = np.where(flight.diverged, np.inf, np.linalg.norm(flight.error, axis=-1))
+    most = rotor_limits(config.plant, part.scenarios)[..., None]
+    near = near_limit(AT_LIMIT_WITHIN, flight.rotor_force, most).max(axis=(-2, -1))
+    outside, rows = ~(far <= part.bounds), np.arange(1, len(far) + 1)[:, None]
+    last = (outside * rows).max(axis=0)
+    seconds = np.where(last == len(far), np.inf, np.maximum(last, 1) * config.timing.control_period)
+    return Measured(seconds, near.mean(axis=0), far[2 * len(far) // 3 :].max(axis=0))
 
 
 class Search:
     """The cost of sets of one controller on all parts, and its log."""
 
-    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: ProcessPoolExecutor | None = None):
-        self.tuned, self._name, self._parts, self._log, self._pool = TUNED[name], name, parts, log, pool
-        self._flown = [Flown(name, part.undisturbed if name in ORACLES else part) for part in parts]
-        self._known = [None if name in ORACLES else known(part) for part in parts]
+    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: Executor):
+        self.tuned, self._name, self._log, self._pool = TUNED[name], name, log, pool
+        self._threads = ThreadPoolExecutor(2 * len(parts))  # which compile and fly all plants at once
+        both = [kind for part in parts for kind in (part.undisturbed, part.strict)]
+        self._parts = both if name in ORACLES else list(parts)
+        compiled = self.tuned.arrays is not None
+        self._flown = [Flown(name, part) if compiled else None for part in self._parts]
+        self._known = [None] * len(both) if name in ORACLES else list(self._threads.map(known, parts))
         self._begun = time.perf_counter()
 
     def __call__(self, sets: np.ndarray) -> np.ndarray:
         """(S,) costs of `sets` (S, k), values of what is `searched`."""
         tunings = [tuned(self.tuned.start, values) for values in sets]
-        found = [
-            parts_of_cost(flown(designs(self._name, part.config, tunings, self._pool)), known)
-            for flown, part, known in zip(self._flown, self._parts, self._known, strict=True)
-        ]
-        costs = np.mean([parts["cost"] for parts in found], axis=0)
+        flown = self._threads.map(
+            lambda part, fly: fly_all(self._name, part, tunings, fly, self._pool), self._parts, self._flown
+        )
+        numbers = [numbers_of(*both) for both in zip(flown, self._known, strict=True)]
+        of_flights = {name: np.concatenate([one[name] for one in numbers], axis=1) for name in numbers[0]}
+        conditions = np.concatenate([part.conditions for part in self._parts])
+        parts = {
+            name: {key: values[:, conditions == name] for key, values in of_flights.items()}
+            for name in dict.fromkeys(conditions)
+        }
         for number, tuning in enumerate(tunings):
-            parts = [
-                {"condition": part.condition, **{key: round(float(values[number]), 4) for key, values in own.items()}}
-                for part, own in zip(self._parts, found, strict=True)
-            ]
-            self._write({"cost": round(float(costs[number]), 4), "tuning": tuning._asdict(), "parts": parts})
-        return costs
+            record = {name: summary({k: v[number] for k, v in own.items()}) for name, own in parts.items()}
+            cost = round(float(of_flights["cost"][number].mean()), 4)
+            self._write({"cost": cost, "tuning": tuning._asdict(), **record})
+        return np.asarray(of_flights["cost"].mean(axis=1))
 
     def _write(self, record: dict[str, Any]) -> None:
         if self._log:
@@ -215,26 +257,32 @@ class Search:
 def known(part: Part) -> Measured:
     """The flights of `oracle`."""
     name = ORACLES[part.config.autopilot.kind == "crazyflie"]
-    return Flown(name, part.undisturbed)(designs(name, part.config, [TUNED[name].start], None))
+    with ThreadPoolExecutor(1) as alone:
+        return fly_all(name, part.undisturbed, [TUNED[name].start], Flown(name, part.undisturbed), alone)
 
 
-def parts_of_cost(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
-    """(S,) each: the cost, the mean time [s] or ratio, the share of successes, of time at limits, the 90 % peak [m]."""
-    late = np.minimum(measured.time, SECONDS)
-    limited = measured.limited > LIMITED
+def numbers_of(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
+    """(S, n) each: cost, time [s], success (0, 1), share of time at limits and peak [m] of every flight."""
+    late, limited = np.minimum(measured.time, SECONDS), measured.limited > LIMITED
     if known is None:
         succeeds, ratio = np.isfinite(measured.time) & ~limited, late
     else:
         succeeds = (measured.time <= LATER * known.time) & ~limited
         ratio = np.minimum(late / np.minimum(known.time, SECONDS), WORST)
     return {
-        "cost": ratio.mean(axis=1) + (1.0 - succeeds.mean(axis=1)),
-        "time": ratio.mean(axis=1),
-        "median": np.median(late, axis=1),
-        "succeeded": succeeds.mean(axis=1),
-        "limited": measured.limited.mean(axis=1),
-        "peak_90": np.quantile(measured.peak, 0.9, axis=1),
+        "cost": ratio + 1.0 - succeeds,
+        "time": late,
+        "succeeded": succeeds.astype(float),
+        "limited": measured.limited,
+        "peak": measured.peak,
     }
+
+
+def summary(numbers: dict[str, np.ndarray]) -> dict[str, float]:
+    """One line of numbers (n,) of flights: means, the median time, the 90 % peak."""
+    found = {name: numbers[name].mean() for name in ("cost", "succeeded", "limited")}
+    found |= {"median": np.median(numbers["time"]), "peak_90": np.quantile(numbers["peak"], 0.9)}
+    return {name: round(float(value), 4) for name, value in found.items()}
 
 
 def searched(tuning: Any) -> list[str]:
@@ -247,42 +295,6 @@ def tuned(given: Any, values: np.ndarray) -> Any:
     return given._replace(**dict(zip(searched(given), map(float, values), strict=True)))
 
 
-def minimise(
-    cost: Callable[[np.ndarray], np.ndarray], start: np.ndarray, width: float, sets: int, rounds: int
-) -> tuple[np.ndarray, float]:
-    """(point (k,), its cost) where `cost` of points (S, k) is least, found by CMA-ES about `start` (k,)."""
-    k, random = len(start), np.random.default_rng(SEED)
-    weights = np.log(sets / 2 + 0.5) - np.log(np.arange(1, sets // 2 + 1))
-    weights /= weights.sum()
-    mu = 1 / (weights**2).sum()
-    c_path, c_width = (4 + mu / k) / (k + 4 + 2 * mu / k), (mu + 2) / (k + mu + 5)
-    c_one = 2 / ((k + 1.3) ** 2 + mu)
-    c_mu = min(1 - c_one, 2 * (mu - 2 + 1 / mu) / ((k + 2) ** 2 + mu))
-    damping = 1 + 2 * max(0.0, math.sqrt((mu - 1) / (k + 1)) - 1) + c_width
-    length = math.sqrt(k) * (1 - 1 / (4 * k) + 1 / (21 * k * k))
-    mean, covariance, path, width_path = start.copy(), np.eye(k), np.zeros(k), np.zeros(k)
-    best, least = start, math.inf
-    for number in range(rounds):
-        values, axes = np.linalg.eigh(covariance)
-        root = axes * np.sqrt(np.maximum(values, 1e-20))
-        steps = random.standard_normal((sets, k)) @ root.T
-        found = cost(mean + width * steps)
-        order = np.argsort(found)
-        if found[order[0]] < least:
-            best, least = mean + width * steps[order[0]], float(found[order[0]])
-        step = weights @ steps[order[: len(weights)]]
-        mean = mean + width * step
-        white = axes @ ((axes.T @ step) / np.sqrt(np.maximum(values, 1e-20)))
-        width_path = (1 - c_width) * width_path + math.sqrt(c_width * (2 - c_width) * mu) * white
-        path = (1 - c_path) * path + math.sqrt(c_path * (2 - c_path) * mu) * step
-        chosen = steps[order[: len(weights)]]
-        covariance = (1 - c_one - c_mu) * covariance + c_one * np.outer(path, path)
-        covariance += c_mu * (chosen.T * weights) @ chosen
-        width *= math.exp(c_width / damping * (np.linalg.norm(width_path) / length - 1))
-        print(f"round {number + 1}: {least:.3f} median {np.median(found):.3f} width {width:.3f}", flush=True)
-    return best, least
-
-
 def main() -> None:
     """Search, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -290,15 +302,20 @@ def main() -> None:
     parser.add_argument("--track", default="pair", help="whose plants and loads fly")
     parser.add_argument("--condition", choices=(*BOUNDS, "both"), default="both")
     parser.add_argument("--flights", type=int, default=FLIGHTS, help="of each plant")
+    parser.add_argument("--plants", type=int, help="of the track; all if not given")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--sets", type=int, default=SETS, help="in each round")
     parser.add_argument("--width", type=float, default=WIDTH, help="of the first steps, in the logarithm")
-    parser.add_argument("--cores", type=int, default=1, help="processes that solve the Riccati equations")
+    parser.add_argument("--cores", type=int, default=1, help="processes that compute designs, and that fly `mpc`")
     parser.add_argument("--log", type=Path, metavar="FILE", help="JSON lines, added to")
     options = parser.parse_args()
     enable_compilation_cache()
-    with ProcessPoolExecutor(options.cores) if options.cores > 1 else contextlib.nullcontext() as pool:
-        parts = flights_of(options.track, options.condition, options.flights)
+    with (
+        ProcessPoolExecutor(options.cores, multiprocessing.get_context("spawn"))
+        if options.cores > 1
+        else ThreadPoolExecutor(1) as pool
+    ):
+        parts = flights_of(options.track, options.condition, options.flights, options.plants)
         search = Search(options.controller, parts, options.log, pool)
         start = np.log([getattr(search.tuned.start, name) for name in searched(search.tuned.start)])
         best, least = minimise(lambda sets: search(np.exp(sets)), start, options.width, options.sets, options.rounds)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
 from mjxball.baselines.crazyflie_oracle import CrazyflieOracle
-from mjxball.baselines.lqg import Lqg
+from mjxball.baselines.lqg import CalmLqg, Lqg, WorldLqg
 from mjxball.baselines.mpc import Mpc
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.oracle import Oracle
@@ -25,8 +25,10 @@ __all__ = [
     "BASELINES",
     "CONTROLLERS",
     "Adaptive",
+    "CalmLqg",
     "Copy",
     "CrazyflieLqg",
+    "CrazyflieOracle",
     "Lqg",
     "Mpc",
     "Observer",
@@ -34,6 +36,7 @@ __all__ = [
     "Pid",
     "Random",
     "Stay",
+    "WorldLqg",
     "make_baseline",
     "make_controller",
 ]
@@ -48,9 +51,11 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "pid": Pid,
     "observer": Observer,
     "lqg": lambda config: _of_kind(config, Lqg, CrazyflieLqg),
+    "lqg-calm": lambda config: _of_kind(config, CalmLqg, CrazyflieLqg),
+    "lqg-world": lambda config: _of_kind(config, WorldLqg, CrazyflieLqg),
     "mpc": Mpc,
 }
-VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc", "lqg-known-failures")
+VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-calm", "lqg-world", "mpc")
 BASELINES = tuple(name for name in CONTROLLERS if name not in VARIANTS)  # default followers of `eval.py`
 
 

@@ -1,21 +1,16 @@
-"""LQG for two Crazyflies on a stick along y, from a linear model with their cascades and the leader's PID (ours).
-
-All quantities are deviations from the level hover at the goal; angles and torques are about body x.
-"""
+"""LQG for two Crazyflies on a stick along y, and what `oracle` shares with it (ours)."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
+from mjxball.baselines.crazyflie_model import MEASURED, Decay, LinearModel, linear_model
 from mjxball.baselines.linear import discretise, regulator, riccati, times
-from mjxball.config import Config, ball_limit
-from mjxball.control.constants import drone_loop, thrust_slopes
+from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
@@ -26,77 +21,49 @@ if TYPE_CHECKING:
 LOAD_COST = 1e-2  # of a rolling ball's torque with a cost of 1 [N m]
 ROLLING_NOISE = 2e-3  # walk of `load_rate` if the model includes a rolling ball
 POSITION_NOISE = 3e-3  # standard deviation of measured y and height, to which the others refer [m]
-# Measured states: index in an observation, sign.
-MEASURED = {
-    "y": (13, -1.0),
-    "vy": (16, -1.0),
-    "roll": (3, 1.0),
-    "rate": (9, 1.0),
-    "height": (14, -1.0),
-    "climb": (17, -1.0),
-}
 LONGEST_DELAY = 8  # control steps
-STATES = (
-    "y",  # of the CG of all [m]
-    "vy",  # [m/s]
-    "roll",  # [rad]
-    "rate",  # [rad/s]
-    "torque",  # of all rotors about their own drone [N m]
-    "rate_integral",  # of the leader's rate loop [rad]
-    "height",  # of O [m]
-    "climb",  # [m/s]
-    "leader_thrust",  # [N]
-    "follower_thrust",  # [N]
-    "leader_integral",  # integral of the leader's height error [m s]
-    "load",  # disturbance torque: the ball, unequal rotors [N m]
-    "load_rate",  # its rate [N m/s]
-    "lift",  # disturbance force: errors of mass and thrust [N]
-    "wind",  # disturbance acceleration along y [m/s2]
-)
-LATERAL = ("y", "vy", "wind")  # states that a stand locks
-ROLLING = 5 / 7  # acceleration of a rolling ball over that of a sliding one
 
 
 class Costs(NamedTuple):
     """Values with a cost of 1, and the largest error that the feedback acts on."""
 
-    y: float = 0.1  # of O [m]
-    vy: float = 0.5  # [m/s]
-    height: float = 0.1  # [m]
-    climb: float = 0.5  # [m/s]
-    rate: float = 3.0  # [rad/s]
-    thrust_difference: float = 0.05  # [N]
-    roll_change: float = 2.0  # of the roll command [rad/s]
-    vertical_change: float = 20.0  # of the vertical acceleration [m/s3]
-    error_limit: float = 0.1  # the motors have little thrust to spare [m]
+    y: float = 0.0272  # of O [m]
+    vy: float = 0.72  # [m/s]
+    height: float = 0.0506  # [m]
+    climb: float = 0.0872  # [m/s]
+    rate: float = 0.289  # [rad/s]
+    thrust_difference: float = 0.602  # [N]
+    roll_change: float = 0.779  # of the roll command [rad/s]
+    vertical_change: float = 45.3  # of the vertical acceleration [m/s3]
+    error_limit: float = 0.147  # the motors have little thrust to spare [m]
 
 
 class Tuning(NamedTuple):
     """Parameters of the controller: those of `Costs`, then walks as standard deviations after a second, and others."""
 
-    y: float = 0.1
-    vy: float = 0.5
-    height: float = 0.1
-    climb: float = 0.5
-    rate: float = 3.0
-    thrust_difference: float = 0.05
-    roll_change: float = 2.0
-    vertical_change: float = 20.0
-    error_limit: float = 0.1
-    load_rate_walk: float = 0.2
-    load_walk: float = 1e-3
-    lift_walk: float = 0.02
-    wind_walk: float = 0.1
-    rate_walk: float = 0.1
-    velocity_walk: float = 0.1
-    load_rate_time: float = 1.0  # time constants with which disturbances decay [s]
-    load_time: float = 50.0
-    lift_time: float = 50.0
-    wind_time: float = 50.0
-    velocity_noise: float = 2e-2  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
-    angle_noise: float = 5e-3  # [rad]
-    rate_noise: float = 2e-2  # [rad/s]
-    delay: float = 3.0  # of the measurements, rounded [control steps]
+    y: float = 0.0859
+    vy: float = 0.878
+    height: float = 0.16
+    climb: float = 0.419
+    rate: float = 4.33
+    thrust_difference: float = 0.152
+    roll_change: float = 2.71
+    vertical_change: float = 43.1
+    error_limit: float = 0.121
+    load_rate_walk: float = 0.202
+    load_walk: float = 0.00182
+    lift_walk: float = 0.0118
+    wind_walk: float = 0.118
+    rate_walk: float = 0.084
+    velocity_walk: float = 0.0843
+    load_rate_time: float = 2.02  # time constants with which disturbances decay [s]
+    load_time: float = 32
+    lift_time: float = 33
+    wind_time: float = 30.5
+    velocity_noise: float = 0.0325  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 0.00877  # [rad]
+    rate_noise: float = 0.0322  # [rad/s]
+    delay: float = 3.6  # of the measurements, rounded [control steps]
 
     @property
     def costs(self) -> Costs:
@@ -108,76 +75,10 @@ class Tuning(NamedTuple):
         """Delay in control steps."""
         return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
 
-
-class LinearModel(NamedTuple):
-    """x' = a x + b (follower's roll [rad], vertical acceleration [m/s2])."""
-
-    a: Float[np.ndarray, "n n"]
-    b: Float[np.ndarray, "n 2"]
-    measured: Float[np.ndarray, "k n"]  # of O, those of `MEASURED` that the model has
-    names: tuple[str, ...]  # n of `STATES`
-    rate_integral_limit: float  # [rad]
-    load_limit: float  # [N m]
-
-    def indices(self, names: Iterable[str]) -> list[int]:
-        """Indices in x of those `names` that the model has."""
-        return [self.names.index(name) for name in names if name in self.names]
-
     @property
-    def shown(self) -> list[str]:
-        """Names of the measurements."""
-        return [name for name in MEASURED if name in self.names]
-
-
-def linear_model(config: Config, tuning: Tuning) -> LinearModel:
-    """The model for the plant of `config`, with disturbances that decay as `tuning` says."""
-    plant, leader = config.plant, config.leader
-    assembly, loop = assembly_model(config, "lqg"), drone_loop(config, 0)
-    lag, half = plant.rotor_lag, 0.5 * float(assembly.mounts[0, 1] - assembly.mounts[1, 1])
-    n, at = len(STATES), {name: place for place, name in enumerate(STATES)}
-    eye = np.eye(n)
-    row = {name: eye[place] for name, place in at.items()}
-    a, b = np.zeros((n, n)), np.zeros((n, 2))
-    free = float(plant.stand == "free")
-    tilt = half if leader.error == "own" else 0.0  # the leader measures its own height
-    leader_height, leader_climb = row["height"] + tilt * row["roll"], row["climb"] + tilt * row["rate"]
-    leader_vertical = leader.ki[2] * row["leader_integral"] - leader.kp[2] * leader_height - leader.kd[2] * leader_climb
-
-    total = float(assembly.known_mass.sum()) + plant.object_mass
-    reaction = 1.0 / (plant.gravity * total)  # O is where the CG is, minus m c / M; the load's torque is -g m c
-    y, vy = row["y"] + reaction * row["load"], row["vy"] + reaction * row["load_rate"]
-    leader_roll = free * (leader.kp[1] * y + leader.kd[1] * vy) / plant.gravity
-    a[at["y"]], a[at["vy"]] = row["vy"], row["wind"] - plant.gravity * row["roll"]
-    a[at["roll"]] = row["rate"]
-    thrust_torque = half * (row["leader_thrust"] - row["follower_thrust"])
-    a[at["rate"]] = (row["torque"] + thrust_torque + row["load"]) / assembly.inertia[0]
-    commanded = loop.kp * (leader_roll - 2 * row["roll"]) - 2 * loop.kd * row["rate"] - 2 * loop.kdd * a[at["rate"]]
-    a[at["torque"]] = (commanded + loop.integral_gain * row["rate_integral"] - row["torque"]) / lag
-    b[at["torque"], 0] = loop.kp / lag
-    a[at["rate_integral"]] = loop.stiffness * (leader_roll - row["roll"]) - row["rate"]
-
-    a[at["height"]] = row["climb"]
-    a[at["climb"]] = (row["leader_thrust"] + row["follower_thrust"] + row["lift"]) / total
-    leader_slope, follower_slope = thrust_slopes(config)
-    a[at["leader_thrust"]] = (leader_slope * leader_vertical - row["leader_thrust"]) / lag
-    a[at["follower_thrust"]] = -row["follower_thrust"] / lag
-    b[at["follower_thrust"], 1] = follower_slope / lag
-    # The integral is of the error and its rate, `integral_lead_time` ahead.
-    a[at["leader_integral"]] = -leader_height - leader.integral_lead_time * leader_climb
-
-    a[at["load"]] = row["load_rate"] - row["load"] / tuning.load_time
-    a[at["lift"]], a[at["wind"]] = -row["lift"] / tuning.lift_time, -row["wind"] / tuning.wind_time
-    ball = plant.moving_fraction * plant.object_mass
-    if config.motion.kind == "rolling":
-        a[at["load_rate"]] = ROLLING * ball * plant.gravity**2 * row["roll"]
-    else:
-        a[at["load_rate"]] = -row["load_rate"] / tuning.load_rate_time
-    names = [name for name in STATES if free or name not in LATERAL]
-    indices = [at[name] for name in names]
-    limit = ball * plant.gravity * ball_limit(plant) if config.motion.kind == "rolling" else math.inf
-    outputs = row | {"y": y, "vy": vy}
-    measured = np.array([outputs[name] for name in MEASURED if name in names])[:, indices]
-    return LinearModel(a[np.ix_(indices, indices)], b[indices], measured, tuple(names), loop.integral_limit, limit)
+    def decay(self) -> Decay:
+        """That of the disturbances."""
+        return Decay(self.load_rate_time, self.load_time, self.lift_time, self.wind_time)
 
 
 def changes(model: LinearModel, costs: Costs, period: float) -> Float[np.ndarray, "2 n+2"]:
@@ -217,7 +118,7 @@ class CrazyflieDesign(NamedTuple):
 
 def design(config: Config, tuning: Tuning) -> CrazyflieDesign:
     """The controller for the plant of `config`."""
-    model, period = linear_model(config, tuning), config.timing.control_period
+    model, period = linear_model(config, tuning.decay), config.timing.control_period
     transition, drive = discretise(model.a, model.b, period)
     walks = {"load_rate": tuning.load_rate_walk, "load": tuning.load_walk, "lift": tuning.lift_walk}
     walks |= {
@@ -302,7 +203,7 @@ class Actuators:
     def __init__(self, config: Config, name: str):
         if config.plant.cg_axis != "y" or config.plant.stand == "pivot":
             raise InputError(f"follower {name!r} flies two Crazyflies along y, free or on the stand with height free")
-        self.assembly, self.model = assembly_model(config, name), linear_model(config, Tuning())
+        self.assembly, self.model = assembly_model(config, name), linear_model(config, Decay())
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._bounds = np.full(len(self.model.names), np.inf)
         limits = {"rate_integral": self.model.rate_integral_limit, "load": self.model.load_limit}

@@ -9,7 +9,8 @@ import numpy as np
 
 from mjxball.arrays import Array, joined
 from mjxball.baselines.assembly_model import CopiedPid
-from mjxball.baselines.crazyflie_lqg import Actuators, Costs, Tuning, changes, linear_model
+from mjxball.baselines.crazyflie_lqg import Actuators, Costs, changes
+from mjxball.baselines.crazyflie_model import Decay, linear_model
 from mjxball.config import Config
 from mjxball.control.constants import drone_loop
 from mjxball.control.crazyflie import unpack
@@ -28,7 +29,7 @@ class CrazyflieOracle:
         self._actuators, self._pid = Actuators(config, self.name), CopiedPid(config)
         self._assembly, self._names = self._actuators.assembly, self._actuators.model.names
         costs, period = tuning or self.tuning, config.timing.control_period
-        self.gains = changes(linear_model(config, Tuning()), costs, period), np.array(costs.error_limit)
+        self.gains = changes(linear_model(config, Decay()), costs, period), np.array(costs.error_limit)
         self._loop, leader = drone_loop(config, 0), config.leader
         self._pd = (leader.kp[1] / config.plant.gravity, leader.kd[1] / config.plant.gravity)
         self._limit = config.command.tilt_limit

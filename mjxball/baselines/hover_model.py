@@ -42,7 +42,6 @@ LOAD, LOAD_RATE, LOAD_CURVE, WIND, LIFT_ERROR = (
 )
 STATES = 22
 ACROSS = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from (roll, pitch) to (x, y): of an acceleration over g, or of m c g
-LOAD_DAMPING = 0.05  # of the load's oscillation
 # Indices in an observation of the measurements: error of O and its rate, roll, pitch and their rates.
 MEASURED = (12, 13, 14, 15, 16, 17, 3, 4, 9, 10)
 
@@ -51,6 +50,7 @@ class LoadModel(NamedTuple):
     """How disturbances are assumed to change: d''' = -w^2 d' - 2 zeta w d'' about a slowly varying torque d."""
 
     frequency: float = 1.5  # w [rad/s]
+    damping: float = 0.05  # zeta
     load_time: float = np.inf  # time constants with which torque, wind and error of the lift decay [s]
     wind_time: float = np.inf
     lift_time: float = np.inf
@@ -151,7 +151,7 @@ def drift_of(load: LoadModel, seconds: float) -> np.ndarray:
     drift = np.eye(STATES)
     drift[ERRORS, RATES] = seconds * np.eye(3)
     drift[TILT, TURN] = seconds * np.eye(2)
-    spring, damping = -(load.frequency**2), -2.0 * LOAD_DAMPING * load.frequency
+    spring, damping = -(load.frequency**2), -2.0 * load.damping * load.frequency
     own = expm(seconds * np.array([[-1.0 / load.load_time, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, spring, damping]]))
     parts = (LOAD, LOAD_RATE, LOAD_CURVE)
     for row, values in zip(parts, own, strict=True):

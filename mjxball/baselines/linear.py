@@ -1,38 +1,11 @@
-"""Building blocks of linear controllers: sampled models, steady-state Kalman filters, LQR gains."""
+"""Building blocks of linear controllers: sampled models, LQR gains, Riccati equations."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
-
 import numpy as np
-from scipy.linalg import expm, solve_continuous_are
+from scipy.linalg import expm
 
 from mjxball.arrays import Array, matmul
-
-
-class Filter(NamedTuple):
-    """Steady-state Kalman filter of x <- A x + B u with the measurement y: x <- x + K (y - C x).
-
-    Its state is the x (..., n) predicted for the next measurement.
-    """
-
-    transition: Array  # A (n, n)
-    drive: Array  # B (n, m)
-    gain: Array  # K (n, k)
-    measured: Array  # C (k, n)
-
-    def start(self, y: Array) -> Array:
-        """State (..., n) at the first measurement `y` (..., k); states that are not measured are 0."""
-        return times(self.measured.T, y)
-
-    def corrected(self, x: Array, y: Array) -> Array:
-        """The predicted state `x` (..., n) corrected by the measurement `y` (..., k)."""
-        return x + times(self.gain, y - times(self.measured, x))
-
-    def moved(self, x: Array, u: Array) -> Array:
-        """The state predicted one period after `x` (..., n) with the input `u` (..., m)."""
-        return times(self.transition, x) + times(self.drive, u)
 
 
 def times(matrix: Array, vector: Array) -> Array:
@@ -48,23 +21,6 @@ def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray,
     return whole[:n, :n], whole[:n, n:]
 
 
-def kalman(
-    transition: np.ndarray, drive: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
-) -> Filter:
-    """The filter of x <- A x + B u every `period` [s], with `transition` A and `drive` B.
-
-    `walks` maps the index of a state to the intensity of its process noise. `noise` maps the index of a measured state
-    to the standard deviation of its measurement, in the order of the measurements.
-    """
-    process_noise = np.zeros_like(transition)
-    for state, intensity in walks.items():
-        process_noise[state, state] = intensity * period
-    measured, measurement_noise = np.eye(len(transition))[list(noise)], np.diag([v**2 for v in noise.values()])
-    predicted = riccati(transition.T, measured.T, process_noise, measurement_noise)
-    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
-    return Filter(transition, drive, gain, measured)
-
-
 def regulator(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(K (m, n) of the u = -K x that minimises the sum of x'Qx + u'Ru, W (m, m)) for x <- A x + B u.
 
@@ -73,11 +29,6 @@ def regulator(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> tup
     value = riccati(a, b, q, r)
     cost = r + b.T @ value @ b
     return np.linalg.solve(cost, b.T @ value @ a), cost
-
-
-def continuous_regulator(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """K (m, n) of u = -K x that minimises the integral of x'Qx + u'Ru for x' = A x + B u."""
-    return np.linalg.solve(r, b.T @ solve_continuous_are(a, b, q, r))
 
 
 def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import regulator, riccati, times
-from mjxball.baselines.sharing import Assumed, Sharing, Wanted, level
+from mjxball.baselines.sharing import Assumed, Wanted, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 
@@ -47,41 +47,42 @@ ROWS = 14  # of `Feedback`
 class Costs(NamedTuple):
     """What the LQR weighs, and limits of what it acts on."""
 
-    position: float = 0.16  # horizontal error with a cost of 1 [m]
-    velocity: float = 0.5  # and its rate [m/s]
-    height: float = 0.2  # vertical error with a cost of 1 [m]
-    climb: float = 0.6  # and its rate [m/s]
-    error_limit: float = 0.9  # largest horizontal error that is acted on [m]
-    tilt_limit: float = 0.3  # largest tilt that errors and rates ask for [rad]
-    height_limit: float = 0.9  # largest vertical error that is acted on [m]
-    climb_limit: float = 2.5  # largest vertical acceleration that errors and rates ask for [m/s2]
+    position: float  # horizontal error with a cost of 1 [m]
+    velocity: float  # and its rate [m/s]
+    height: float  # vertical error with a cost of 1 [m]
+    climb: float  # and its rate [m/s]
+    error_limit: float  # largest horizontal error that is acted on [m]
+    tilt_limit: float  # largest tilt that errors and rates ask for [rad]
+    height_limit: float  # largest vertical error that is acted on [m]
+    climb_limit: float  # largest vertical acceleration that errors and rates ask for [m/s2]
 
 
 class Tuning(NamedTuple):
     """Parameters of the controller: those of `Costs`, and of the filter and its model."""
 
-    position: float = 0.079
-    velocity: float = 0.306
-    height: float = 0.0379
-    climb: float = 0.261
-    error_limit: float = 0.499
-    tilt_limit: float = 0.331
-    height_limit: float = 0.18
-    climb_limit: float = 4.59
-    load_walk: float = 639  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
-    load_frequency: float = 1.14  # of the load's oscillation [rad/s]
-    load_time: float = 21  # time constant with which its torque is forgotten [s]
-    wind_walk: float = 0.129  # noise intensity of the wind's acceleration [(m/s2)2/s]
-    wind_time: float = 51.1  # time constant with which it is forgotten [s]
-    lift_walk: float = 0.00539  # as of the wind, of errors of mass and thrust
-    lift_time: float = 87.3
-    acceleration_walk: float = 0.0144  # of every velocity [(m/s)2/s]
-    turn_walk: float = 0.0349  # of roll and pitch rate [(rad/s)2/s]
-    velocity_noise: float = 0.0292  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
-    angle_noise: float = 0.00194  # [rad]
-    rate_noise: float = 0.0166  # [rad/s]
-    loop_scale: float = 1.04  # assumed factor on the attitude loops' natural frequency
-    delay: float = 0.917  # of the measurements, rounded [control steps]
+    position: float = 0.0567
+    velocity: float = 0.294
+    height: float = 0.0497
+    climb: float = 0.256
+    error_limit: float = 0.425
+    tilt_limit: float = 0.379
+    height_limit: float = 0.205
+    climb_limit: float = 4.83
+    load_walk: float = 638  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
+    load_frequency: float = 1.05  # of the load's oscillation [rad/s]
+    load_damping: float = 0.0491  # of that oscillation
+    load_time: float = 31.4  # time constant with which its torque is forgotten [s]
+    wind_walk: float = 0.207  # noise intensity of the wind's acceleration [(m/s2)2/s]
+    wind_time: float = 56.5  # time constant with which it is forgotten [s]
+    lift_walk: float = 0.0112  # as of the wind, of errors of mass and thrust
+    lift_time: float = 70.2
+    acceleration_walk: float = 0.0129  # of every velocity [(m/s)2/s]
+    turn_walk: float = 0.0244  # of roll and pitch rate [(rad/s)2/s]
+    velocity_noise: float = 0.0283  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 0.0027  # [rad]
+    rate_noise: float = 0.022  # [rad/s]
+    loop_scale: float = 0.993  # assumed factor on the attitude loops' natural frequency
+    delay: float = 0.859  # of the measurements, rounded [control steps]
 
     @property
     def costs(self) -> Costs:
@@ -91,12 +92,42 @@ class Tuning(NamedTuple):
     @property
     def load(self) -> LoadModel:
         """That of the disturbances."""
-        return LoadModel(self.load_frequency, self.load_time, self.wind_time, self.lift_time)
+        return LoadModel(self.load_frequency, self.load_damping, self.load_time, self.wind_time, self.lift_time)
 
     @property
     def late(self) -> int:
         """Delay in control steps."""
         return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
+
+
+CALM = Tuning()
+WORLD = Tuning()
+# Of several followers, whose sensors and noises disagree: what each of them estimates must be forgotten.
+TEAM = Tuning(
+    position=0.0105,
+    velocity=0.175,
+    height=0.0194,
+    climb=0.853,
+    error_limit=0.168,
+    tilt_limit=0.885,
+    height_limit=0.204,
+    climb_limit=4.06,
+    load_walk=499,
+    load_frequency=4.55,
+    load_damping=0.436,
+    load_time=1.2,
+    wind_walk=0.00312,
+    wind_time=2.58,
+    lift_walk=0.00437,
+    lift_time=13.5,
+    acceleration_walk=0.00389,
+    turn_walk=0.374,
+    velocity_noise=0.0176,
+    angle_noise=0.00244,
+    rate_noise=0.0414,
+    loop_scale=1.1,
+    delay=1.9,
+)
 
 
 class Feedback(NamedTuple):
@@ -108,13 +139,23 @@ class Feedback(NamedTuple):
     error_limit: Float[Array, "... 3"]  # [m]
     limit: Float[Array, "... 3"]  # [rad], [rad], [m/s2]
 
-    def wanted(self, values: Array) -> Wanted:
-        """What all drones should do for `values` (..., 14) of `rows`."""
+    def wanted(self, values: Array, stiffness: Array | None = None) -> Wanted:
+        """What all drones should do for `values` (..., 14) of `rows`.
+
+        `stiffness` (...) of the attitude loops over that which the limits are for. A stiffer leader saturates its
+        rotors sooner against a tilt that it does not command: errors may then ask for less beside its command.
+        """
         xp = values.__array_namespace__()
         gain, most, limit = (xp.asarray(part, dtype=values.dtype) for part in self[1:])
         far = times(gain, xp.clip(values[..., :3], -most, most)) + values[..., 3:6]
-        command = xp.clip(far, -limit, limit) + values[..., 6:9]
-        return Wanted(command, values[..., 9:12], values[..., 12:14])
+        led = values[..., 9:12]
+        middle = 0.0 * led
+        if stiffness is not None:
+            share = 1.0 / xp.maximum(stiffness, 1.0 + 0.0 * stiffness)[..., None]
+            limit = xp.concat([share * limit[..., :2], limit[..., 2:] + 0.0 * share], axis=-1)
+            middle = xp.concat([(1.0 - share) * led[..., :2], middle[..., 2:]], axis=-1)
+        command = xp.clip(far, middle - limit, middle + limit) + values[..., 6:9]
+        return Wanted(command, led, values[..., 12:14])
 
 
 def balance(model: HoverModel, gravity: float) -> np.ndarray:
@@ -126,14 +167,19 @@ def balance(model: HoverModel, gravity: float) -> np.ndarray:
     return found
 
 
-def feedback(model: HoverModel, costs: Costs, gravity: float) -> Feedback:
-    """The LQR of errors and rates of O and of the command's deviation from `balance`."""
-    drive, steady = model.drive @ model.commanded, balance(model, gravity)
+def regulated(model: HoverModel, costs: Costs, gravity: float) -> tuple[np.ndarray, np.ndarray]:
+    """(gains (3, 22) of the command's deviation from `balance`, cost (3, 3) of another deviation, see `regulator`)."""
+    drive = model.drive @ model.commanded
     outputs = np.vstack([model.error, model.error_rate])
     weights = np.array([costs.position] * 2 + [costs.height] + [costs.velocity] * 2 + [costs.climb]) ** -2.0
     deviation = np.diag([TILT_COST**-2, TILT_COST**-2, VERTICAL_COST**-2])
-    gains, _ = regulator(model.transition + drive @ steady, drive, outputs.T * weights @ outputs, deviation)
-    whole = steady - gains
+    transition = model.transition + drive @ balance(model, gravity)
+    return regulator(transition, drive, outputs.T * weights @ outputs, deviation)
+
+
+def feedback(model: HoverModel, costs: Costs, gravity: float) -> Feedback:
+    """The LQR of errors and rates of O and of the command's deviation from `balance`."""
+    whole = balance(model, gravity) - regulated(model, costs, gravity)[0]
     position, damping = whole[:, ERRORS], whole[:, RATES] @ model.error_rate
     rest = whole - position @ model.error - damping
     return Feedback(
@@ -155,6 +201,7 @@ class LqgDesign(NamedTuple):
     ahead: Float[Array, "... 14 12"]  # and what the inputs since then add, the newest first
     sent: Float[Array, "... 5"]  # 1 for the input of that time, of the one now and the last four
     delay: Float[Array, "..."]  # control steps
+    loop_scale: Float[Array, "..."]  # assumed factor on the attitude loops' frequency
 
 
 def design(config: Config, tuning: Tuning) -> LqgDesign:
@@ -166,19 +213,25 @@ def design(config: Config, tuning: Tuning) -> LqgDesign:
     ahead = np.zeros((ROWS, 3 * LONGEST_DELAY))
     for number in range(tuning.late):
         ahead[:, 3 * number : 3 * number + 3] = found.rows @ powers[number] @ model.drive
-    process, noise = noises(tuning, assembly.period)
-    predicted = riccati(transition.T, model.measured.T, process, noise)
-    innovation = model.measured @ predicted @ model.measured.T + noise
     return LqgDesign(
         transition=transition,
         drive=model.drive,
-        gain=np.linalg.solve(innovation, model.measured @ predicted).T,
+        gain=filter_gain(model, tuning, assembly.period),
         measured=model.measured,
         feedback=found._replace(rows=found.rows @ powers[-1]),
         ahead=ahead,
         sent=np.eye(LONGEST_DELAY + 1)[tuning.late],
         delay=np.array(float(tuning.late)),
+        loop_scale=np.array(float(tuning.loop_scale)),
     )
+
+
+def filter_gain(model: HoverModel, tuning: Tuning, period: float) -> np.ndarray:
+    """(22, 10) K of the steady-state Kalman filter x <- x + K (y - C x), with the leader in the loop."""
+    process, noise = noises(tuning, period)
+    predicted = riccati(model.with_leader.T, model.measured.T, process, noise)
+    innovation = model.measured @ predicted @ model.measured.T + noise
+    return np.linalg.solve(innovation, model.measured @ predicted).T
 
 
 def noises(tuning: Tuning, period: float) -> tuple[np.ndarray, np.ndarray]:
@@ -203,12 +256,13 @@ class Lqg:
 
     name = "lqg"
     needs_privileged = False
-    tuning = Tuning()
+    tuning, team_tuning = Tuning(), TEAM
 
     def __init__(self, config: Config, tuning: Tuning | None = None):
         self._model = ideal_model(config, self.name)
-        self._sharing = Sharing(config, self._model)
-        self.design = design(config, tuning or self.tuning)
+        self._sharing = sharing(config, self._model)
+        own = self.team_tuning if config.plant.is_team else self.tuning
+        self.design = design(config, tuning or own)
         self._over_inertia = np.linalg.inv(hover_model(config, self._model, LoadModel()).inertia)
 
     def start(self, observation: Array) -> LqgState:
@@ -227,7 +281,9 @@ class Lqg:
         x = state.expected + times(own.gain, y - times(own.measured, state.expected))
         carried = model.carried(privileged.believed_mass)
         wanted = own.feedback.wanted(times(own.feedback.rows, x) + times(own.ahead, state.given))
-        commands, asked = self._sharing(wanted, Assumed(carried, carried.sum(axis=-1), level(seen)))
+        commands, asked = self._sharing(
+            wanted, Assumed(carried, carried.sum(axis=-1), level(seen), None, xp.asarray(own.loop_scale, dtype=x.dtype))
+        )
         asked = xp.concat([times(self._over_inertia, asked[..., :2]), asked[..., 2:]], axis=-1)
         given = xp.concat([asked, state.given], axis=-1)
         sent, late = (xp.asarray(part, dtype=x.dtype) for part in (own.sent, own.delay))
@@ -236,3 +292,17 @@ class Lqg:
         # The first measurements are of the start, where nothing moves.
         expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
         return LqgState(expected, given[..., :-3], state.steps + 1.0), model.own(commands)
+
+
+class CalmLqg(Lqg):
+    """`lqg` for flights that are known to be without noise and delay."""
+
+    name = "lqg-calm"
+    tuning = CALM
+
+
+class WorldLqg(Lqg):
+    """`lqg` for flights that are known to be with noise and delay."""
+
+    name = "lqg-world"
+    tuning = WORLD

@@ -1,9 +1,9 @@
 """Offset-free model-predictive control of pairs and teams within the limits of rotors and commands (ours).
 
-A steady-state Kalman filter on all measurements estimates the motion, the load's torque and the error of the lift;
-`lqg-offset-free` filters only the last two. The controller is the LQR of that motion about the target of these
-estimates, plus corrections v of all drones' mean command over the next second. The cost of an LQR is x'Px plus the sum
-of v'Wv, W = R + B'PB, for any v. The best corrections therefore solve
+The filter and the controller are those of `lqg`: a steady-state Kalman filter of the motion, the load's torque, wind
+and the error of the lift, and the LQR about what balances them. To it come corrections v of all drones' mean command
+over the next second. The cost of an LQR is x'Px plus the sum of v'Wv, W = R + B'PB, for any v. The best corrections
+solve
 
     minimise the sum of v' W v   such that the follower's commands, rotors, tilt and lift keep their limits,
 
@@ -12,15 +12,7 @@ limits, v = 0; OSQP (Stellato et al. 2020) solves the program only for the other
 with a high cost, so that there always is a solution.
 
 Every follower of a team runs it separately, in body axes, on its own measurements, and assumes that the others send the
-same command. Only the sum of their estimates shows in the motion. Each therefore forgets the torque and the error of
-the lift with a time constant of 10 s: a constant load leaves a small error, 1 % of that of `copy`.
-
-Measurements are assumed to be one control step late, between zero and the two steps of flights with delay. The tuning
-of the pair is the best of about 40 sets of `benchmarks/observer_tuning.py mpc` on flights with and without noise and
-delay, of known and of unknown mass; a longer search may find better. Its tilt limit, 0.136 rad, was then raised to
-0.18 rad for a smaller RMSE under noise; in the flights of the search it settles and overshoots about as well. The
-tuning of teams is the best of 24 sets of `benchmarks/observer_tuning.py mpc-team`, which started from the best of about
-25 by hand on such flights, with the time constant of 10 s among them.
+same command; as those of `lqg` they forget what they estimate.
 """
 
 from __future__ import annotations
@@ -32,14 +24,15 @@ from typing import Any
 import numpy as np
 
 from mjxball.arrays import Array, clipped, joined
+from mjxball.baselines.hover_model import LIFT, MEASURED, STATES, TILT, TURN
 from mjxball.baselines.linear import times
-from mjxball.baselines.motion import LIFT, PITCH, PITCH_RATE, ROLL, ROLL_RATE
-from mjxball.baselines.mpc_design import MEASURED, NAME, PAIR, TEAM, Limits, MpcDesign, design, limits_of
+from mjxball.baselines.lqg import Tuning
+from mjxball.baselines.mpc_design import NAME, PAIR, TEAM, Limits, MpcDesign, design, limits_of
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
-from mjxball.control.observation import ERROR, ERROR_RATE, mount_angles
+from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 
 BLOCKS = (1, 1, 1, 2, 2, 3, 4, 6, 8, 10, 12)  # control steps for which a correction is held: 1 s
@@ -48,7 +41,7 @@ MASSES = tuple(0.1 * number for number in range(11))  # of objects [kg]; the des
 BEYOND = 100.0  # cost of exceeding a limit, over that of the correction which avoids it
 # OSQP: step size, largest number of iterations, tolerance in units of the square root of the cost (1e-4 rad).
 RHO, ITERATIONS, TOLERANCE = 3.0, 400, 1e-3
-AXES = ((0, ROLL, ROLL_RATE), (1, PITCH, PITCH_RATE))
+AXES = tuple((axis, TILT.start + axis, TURN.start + axis) for axis in (0, 1))  # with indices of its tilt and rate
 
 
 class QuadraticProgram:
@@ -110,7 +103,7 @@ def limit_rows(own: MpcDesign, limits: Limits, carried: float) -> tuple[np.ndarr
     In this order at every step in `CHECKED`: command (3), rotor forces (4), roll, pitch and lift (3).
     """
     size, count, held = own.drive.shape[0], 3 * len(BLOCKS), np.repeat(np.arange(len(BLOCKS)), BLOCKS)
-    loop, drive = own.forecast + own.drive @ own.feedback, own.drive @ own.correction
+    loop, drive = own.transition + own.drive @ own.feedback, own.drive @ own.correction
     asked, angles = np.diag([*limits.kp, carried])[[2, 0, 1]], np.zeros((3, size))  # lift, roll, pitch torque
     for axis, angle, rate in AXES:
         angles[1 + axis, [angle, rate]] = -limits.kp[axis], -limits.kd[axis]
@@ -121,7 +114,7 @@ def limit_rows(own: MpcDesign, limits: Limits, carried: float) -> tuple[np.ndarr
         command = own.feedback @ moved + own.correction @ chosen
         if step in CHECKED:
             rotors = limits.rotors @ (asked @ command + angles @ moved)
-            found.append(np.vstack([command, rotors, moved[[ROLL, PITCH, LIFT]]]))
+            found.append(np.vstack([command, rotors, moved[[TILT.start, TILT.start + 1, LIFT.start]]]))
         moved = loop @ moved + drive @ chosen
     rows, steps = np.vstack(found), len(CHECKED)
     high = np.concatenate([limits.command, np.full(4, limits.rotor_force), own.far_limit])
@@ -140,20 +133,16 @@ class Mpc:
     name = NAME
     needs_privileged = False
     tuning, team_tuning = PAIR, TEAM
-    delay = 1  # assumed delay of measurements in control steps
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, tuning: Tuning | None = None):
         _osqp()
         plant, self._limits, self._leader = config.plant, limits_of(config), copy_gains(config)
         self._gravity, self._angles, self._others = plant.gravity, mount_angles(plant), plant.count - 1
-        tuning = self.team_tuning if plant.is_team else self.tuning
+        tuning = tuning or (self.team_tuning if plant.is_team else self.tuning)
+        self.delay = tuning.late  # assumed delay of measurements in control steps
         self.designs = [design(config, tuning, mass) for mass in MASSES]
         self._stacked = MpcDesign(*(np.stack(parts) for parts in zip(*self.designs, strict=True)))
-        self._mounts = np.array([drone.mount for drone in plant.drones])[[*plant.followers], :2]  # from O [m]
-        if self._others == 1:
-            self._mounts = self._mounts[0]
         self._programs: dict[int, QuadraticProgram] = {}
-        self._states = self._stacked.drive.shape[-2]
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy gets new solvers."""
@@ -171,9 +160,9 @@ class Mpc:
 
     def start(self, observation: Array) -> Array:
         """See `Controller.start`."""
-        found = dict(zip(MEASURED, self._measured(self._seen(observation)), strict=True))
-        zero = observation.__array_namespace__().zeros_like(observation[..., 0])
-        return joined([found.get(place, zero) for place in range(self._states)] + [zero] * (3 * self.delay))
+        measured, zero = self._seen(observation)[..., list(MEASURED)], 0.0 * observation[..., 0]
+        known = [measured[..., place] for place in range(len(MEASURED))]
+        return joined(known + [zero] * (STATES - len(MEASURED) + 3 * self.delay))
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
         """See `Controller.step`."""
@@ -182,7 +171,7 @@ class Mpc:
         kind = xp.round(clipped(mass, 0.0, MASSES[-1]) / MASSES[1]).astype(int)
         own = MpcDesign(*(xp.asarray(part, dtype=dtype)[kind] for part in self._stacked))
         hover = (self._limits.own_mass + self._limits.load_share * mass) * self._gravity / 4.0
-        x, commands = self._estimate(own, state, observation), state[..., self._states :]
+        x, commands = self._estimate(own, state, observation), state[..., STATES:]
         now = x
         for late in range(self.delay):
             now = self._moved(own, now, commands[..., 3 * late : 3 * late + 3], hover)
@@ -193,8 +182,8 @@ class Mpc:
 
     def _estimate(self, own: MpcDesign, state: Array, observation: Array) -> Array:
         """The filter's state (..., n) corrected by `observation`, at the time of its measurements."""
-        left = joined(self._measured(observation)) - joined([state[..., place] for place in MEASURED])
-        return state[..., : self._states] + times(own.gain, left)
+        x = state[..., :STATES]
+        return x + times(own.gain, observation[..., list(MEASURED)] - times(own.measured, x))
 
     def _seen(self, observation: Array) -> Array:
         """`observation` (..., 18) in body axes; for teams it comes in mount frames."""
@@ -205,16 +194,6 @@ class Mpc:
         if self._angles is None:
             return command
         return clip_command(rotations.turned_about_z(command, -self._angles), *self._leader[-2:])
-
-    def _measured(self, observation: Array) -> list[Array]:
-        """Measurements of `MEASURED`; velocities are means of the object's and of those at O from the follower's."""
-        error, rate, own = observation[..., ERROR], observation[..., ERROR_RATE], observation[..., 6:9]
-        (roll, pitch), (p, q, r) = ((observation[..., place] for place in places) for places in ((3, 4), (9, 10, 11)))
-        ahead, left = observation.__array_namespace__().asarray(self._mounts.T, dtype=observation.dtype)
-        x = 0.5 * (rate[..., 0] - own[..., 0] - left * r)
-        y = 0.5 * (rate[..., 1] - own[..., 1] + ahead * r)
-        z = 0.5 * (rate[..., 2] - own[..., 2] + left * p - ahead * q)
-        return [error[..., 0], x, pitch, q, error[..., 1], y, roll, p, error[..., 2], z]
 
     def _moved(self, own: MpcDesign, x: Array, command: Array, hover: Array) -> Array:
         """State (..., n) one period after `x` with the follower's `command` (..., 3) and saturating rotors."""
@@ -259,7 +238,7 @@ class Mpc:
     def _solve(self, x: Any, hover: Any, kind: Any) -> tuple[np.ndarray, np.ndarray]:
         x, batch = np.asarray(x), np.shape(x)[:-1]
         hover, kind = (np.broadcast_to(np.asarray(part), batch).ravel() for part in (hover, kind))
-        states, first, known = x.reshape(-1, self._states).astype(float), np.zeros((kind.size, 3)), kind >= 0
+        states, first, known = x.reshape(-1, STATES).astype(float), np.zeros((kind.size, 3)), kind >= 0
         for one in np.unique(kind).tolist():
             if one not in self._programs:
                 self._programs[one] = QuadraticProgram(self.designs[one], self._limits, MASSES[one])

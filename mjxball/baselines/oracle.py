@@ -24,7 +24,7 @@ from mjxball.baselines.hover_model import (
 )
 from mjxball.baselines.linear import times
 from mjxball.baselines.lqg import Costs, Feedback, feedback
-from mjxball.baselines.sharing import Assumed, Sharing, level
+from mjxball.baselines.sharing import Assumed, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import ERROR, ERROR_RATE
@@ -104,7 +104,7 @@ class Oracle:
 
     def __init__(self, config: Config, tuning: OracleTuning | None = None):
         self._model = ideal_model(config, self.name)
-        self._sharing = Sharing(config, self._model)
+        self._sharing = sharing(config, self._model)
         self.gains, self._inverse_masses = gains(config, tuning or self.tuning)
         self._moment = rigid_moment(plant_parameters(config.plant, config.attitude))[:2]
 
@@ -118,7 +118,7 @@ class Oracle:
         seen, known = model.in_body_axes(observation), privileged
         carried = model.carried(known.believed_mass)
         own = self._feedback(seen, known)
-        wanted = own.wanted(times(own.rows, self._state(seen, known)))
+        wanted = own.wanted(times(own.rows, self._state(seen, known)), None if scale is None else scale**2)
         # The load's torque grows with the lift.
         kp = len(model.own_mass) * xp.asarray(model.kp, dtype=seen.dtype)
         more = wanted.command[..., 2:] * _turning(self._in_plane(known.moment)) / kp

@@ -23,7 +23,7 @@ def losing(config: Config) -> list[Scenario]:
 def test_a_law_that_is_told_of_the_loss_makes_up_for_it() -> None:
     """At the larger limit of commands that the rotors left over ask for."""
     config = preset("lost")
-    follower = make_baseline("lqg-known-failures", config)
+    follower = make_baseline("oracle", config)
     flights = simulate_batch(config, [(follower, losing(config))], ENGINE)
     distance = np.linalg.norm(flights.error, axis=-1)
     assert distance.max() < 0.3

@@ -1,0 +1,146 @@
+"""The LQG of plants with ideal loops: its filter, prediction and feedback on its own model, and flights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjxball.baselines import make_baseline, make_controller
+from mjxball.baselines.hover_model import ERRORS, LIFT_ERROR, LOAD, MEASURED, RATES, STATES, TILT, TURN, WIND
+from mjxball.baselines.lqg import LONGEST_DELAY, Lqg, Tuning, noises
+from mjxball.config import Config, preset, with_plant
+from mjxball.control.followers import PrivilegedInfo
+from mjxball.plant.teams import ring_config
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import simulate, simulate_batch
+from mjxball.sim.scenario import Scenario
+
+PAPER = preset("paper")
+RING = ring_config(with_plant(PAPER, "team6"), 4)
+KEEPS = {"load_time": np.inf, "wind_time": np.inf, "lift_time": np.inf}  # estimates that are not forgotten
+
+
+class OwnPlant:
+    """The controller's model in place of a plant, driven by what it asks for; measurements are `delay` steps late."""
+
+    def __init__(self, config: Config, tuning: Tuning, x: np.ndarray, delay: int):
+        self.controller = Lqg(config, tuning)
+        zero = np.zeros(())
+        self.known = PrivilegedInfo(np.array(config.plant.object_mass), zero, zero, zero)
+        self.x, self.past, self.delay = x, [x] * (delay + 1), delay
+        self.memory = self.controller.start(self.observation())
+
+    def observation(self, error: np.ndarray | None = None) -> np.ndarray:
+        """(18,) at the time that is measured now."""
+        seen, measured = np.zeros(18), self.controller.design.measured @ self.past[-1 - self.delay]
+        seen[list(MEASURED)] = measured if error is None else measured + error
+        return seen
+
+    def step(self, observation: np.ndarray, push: np.ndarray | float = 0.0) -> None:
+        """One control period, with `push` (22,) added to the state."""
+        own = self.controller.design
+        self.memory, _ = self.controller.step(self.memory, observation, self.known)
+        self.x = own.transition @ self.x + own.drive @ self.memory.given[:3] + push
+        self.past.append(self.x)
+
+
+def started(random: np.random.Generator) -> np.ndarray:
+    """A state near hover, without disturbances."""
+    x = np.zeros(STATES)
+    x[ERRORS], x[RATES] = 0.01 * random.standard_normal(3), 0.0
+    return x
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_the_prediction_is_exact_on_the_model(delay: int) -> None:
+    """What it expects of the next measurement is the state of that time, to rounding, while commands keep changing."""
+    plant = OwnPlant(PAPER, Tuning()._replace(delay=float(delay)), started(np.random.default_rng(0)), delay)
+    for _ in range(40):
+        plant.step(plant.observation())
+        np.testing.assert_allclose(plant.memory.expected, plant.past[-1 - delay], atol=1e-12)
+    assert np.abs(plant.x).max() > 1e-3
+
+
+def test_innovations_are_white_and_of_the_expected_size() -> None:
+    """On its own model with its own noises: 10 numbers of chi-square mean 1, uncorrelated from step to step.
+
+    4000 steps: the mean is good to sqrt(2 / 40 000) = 0.7 %, and a correlation to 1 / sqrt(4000) = 1.6 %.
+    """
+    random, tuning = np.random.default_rng(1), Tuning()._replace(delay=0.0)
+    plant = OwnPlant(PAPER, tuning, np.zeros(STATES), 0)
+    own, (process, noise) = plant.controller.design, noises(tuning, PAPER.timing.control_period)
+    # K = P C' S^-1, so C K = 1 - N S^-1.
+    spread = noise @ np.linalg.inv(np.eye(10) - own.measured @ own.gain).T
+    whitening, found = np.linalg.inv(np.linalg.cholesky(0.5 * (spread + spread.T))), []
+    for _ in range(4500):
+        seen = plant.observation(np.sqrt(np.diag(noise)) * random.standard_normal(10))
+        found.append(whitening @ (seen[list(MEASURED)] - own.measured @ plant.memory.expected))
+        plant.step(seen, np.sqrt(np.diag(process)) * random.standard_normal(STATES))
+    white = np.array(found[500:])
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.05)
+    assert np.abs(np.mean(white[1:] * white[:-1], axis=0)).max() < 0.07
+
+
+@pytest.mark.parametrize("state", [LOAD.start, LOAD.start + 1, WIND.start, WIND.start + 1, LIFT_ERROR.start])
+def test_no_constant_disturbance_leaves_an_error(state: int) -> None:
+    """Torque, wind, lift: the error of O goes to 0 where nothing is forgotten, and the estimate to the truth."""
+    x = np.zeros(STATES)
+    x[state] = 0.3
+    plant = OwnPlant(PAPER, Tuning()._replace(**KEEPS, delay=1.0), x, 1)
+    for _ in range(6000):
+        plant.step(plant.observation())
+    own = plant.controller.design
+    assert np.abs(own.measured[:3] @ plant.x).max() < 1e-6
+    np.testing.assert_allclose(plant.memory.expected[state], 0.3, rtol=1e-4)
+
+
+def test_a_follower_of_a_team_forgets() -> None:
+    """Measured apart, followers differ by what the motion does not show: the controller alone must be stable.
+
+    The response of its commands to a constant error of one sensor is that of its own dynamics, without the plant.
+    """
+    controller = Lqg(RING)
+    own, feedback = controller.design, controller.design.feedback
+    still = np.zeros((3, 18))
+    still[0, 12:14] = 2e-3  # one of three follower measures 2 mm beside the others
+    memory = controller.start(still)
+    known = PrivilegedInfo(np.full(3, RING.plant.object_mass), *[np.zeros((3, 2))] * 2, np.zeros(3))
+    sent = []
+    for _ in range(3000):
+        memory, command = controller.step(memory, still, known)
+        sent.append(command[0])
+    assert own.transition.shape == (STATES, STATES)
+    assert feedback.rows.shape[-1] == STATES
+    np.testing.assert_allclose(sent[-1], sent[-500], atol=1e-3)
+    assert np.abs(sent[-1][:2]).max() < 0.1
+
+
+def test_followers_whose_sensors_disagree_keep_off_the_rotors_limits() -> None:
+    """Under noise level 1 and 40 ms of delay for 20 s."""
+    scenario = Scenario(mass=RING.plant.object_mass, seconds=20.0, disturbance=Disturbance(noise=1.0, delay=0.04))
+    flown = simulate(RING, make_baseline("lqg", RING), scenario, "newton-euler")
+    assert np.linalg.norm(flown.error[flown.time > 10], axis=-1).max() < 0.03
+    most = np.array(RING.plant.of_drones("rotor_force_max"))[:, None]
+    limited = ((flown.rotor_force < 0.01 * most) | (flown.rotor_force > 0.99 * most)).any(axis=(-2, -1))
+    assert limited.mean() < 0.05
+
+
+def test_unknown_masses_and_heavy_loads_settle() -> None:
+    """A pair, calm and with noise and delay, to 10 and 20 mm within 4 s; 0.5 kg at 8 cm leave 15 % of its rotors."""
+    loads = [{"mass": 0.3, "believed_mass": 0.2, "amplitude": 0.08}, {"mass": 0.5, "amplitude": 0.08, "omega": 3.1}]
+    rough = Disturbance(noise=1.0, delay=0.04)
+    scenarios = [Scenario(seconds=12.0, **load, disturbance=how) for how in (Disturbance(), rough) for load in loads]
+    flown = simulate_batch(PAPER, [(make_baseline("lqg", PAPER), scenarios)], "newton-euler")
+    late = np.linalg.norm(flown.error[flown.time > 4], axis=-1).max(axis=0)
+    assert (late < [0.01, 0.01, 0.02, 0.02]).all(), late
+
+
+def test_it_knows_no_more_than_the_believed_mass() -> None:
+    """Other privileged information may be anything."""
+    controller, observation = make_controller("lqg", PAPER), 0.1 * np.random.default_rng(0).standard_normal(18)
+    nothing = PrivilegedInfo(np.array(0.2), None, None, None)
+    state, command = controller.step(controller.start(observation), observation, nothing)
+    assert np.isfinite(command).all()
+    assert state.given.shape == (3 * LONGEST_DELAY,)
+    assert not controller.needs_privileged
+    assert {TILT.start, TURN.start} == {6, 8}
