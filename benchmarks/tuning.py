@@ -1,16 +1,15 @@
 """The tuning of the references of mjxball-bench: a search on flights that no table reports.
 
-`python benchmarks/tuning.py CONTROLLER [--track pair|team|rigs] [--condition both|calm|rough] [--sets N] [--rounds N]
+`python benchmarks/tuning.py CONTROLLER [--track TRACK ...] [--condition both|calm|world] [--sets N] [--rounds N]
 [--flights N] [--width W] [--log FILE]`
 
 CMA-ES (Hansen) over the logarithms of a controller's tuning; it starts from that which the controller has. All sets of
 a round fly all flights as one compiled program, on the CPU or on a GPU; `mpc` solves its programs on the CPU, set by
 set. What is made small is the mean over flights of the time after which |e_o| stays within a bound, over that of
 `oracle` and at most four, plus the share of flights without success: later than 1.25 times `oracle`, or a rotor at its
-limit for more than 5 % of the time. Bounds are 10 mm calm and 20 mm otherwise, times the rig's length over the pair's
-where it is longer, and twice as much for Crazyflies. Of an oracle it is the mean of that time in seconds, for these
-bounds and for three tenths of them. Every set is written to the log, one line of JSON each: its tuning, its cost, and
-the cost's parts.
+limit for more than 5 % of the time. Bounds are those of the benchmark, whose draw 4711 flies here and in no table. Of
+an oracle it is the mean of that time in seconds, for these bounds and for three tenths of them. Every set is written to
+the log, one line of JSON each: its tuning, its cost, and the cost's parts.
 """
 
 from __future__ import annotations
@@ -36,23 +35,23 @@ from cma import minimise
 from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_controller, mpc, oracle
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.pid import Pid
-from mjxball.bench.tracks import worlds_of
+from mjxball.bench import CONDITIONS
+from mjxball.bench.draw import groups_of, with_perfect_sensors
+from mjxball.bench.tracks import TRACKS
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Controller
-from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, near_limit, rotor_limits
+from mjxball.evaluate.metrics import rotor_limits
+from mjxball.evaluate.running_metrics import AT_LIMIT_WITHIN, near_limit
 from mjxball.physics import newton_euler
 from mjxball.physics.step import jax_repeat, make_plant_step
 from mjxball.scalar_form import scalar_form
 from mjxball.sim.closed_loop import ClosedLoop
-from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import Carry, Inputs, control_step, make_privileged_info, scenario_arrays, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
 DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
-BOUNDS = {"calm": 0.01, "rough": 0.02}  # [m]
 STRICT = 0.3  # share of the bounds within which an oracle is asked to stay, too
-CRAZYFLIE_LENGTH = 2.0  # factor on the bounds of Crazyflies
 LATER, LIMITED = 1.25, 0.05  # of a success: time over that of `oracle`, share of time with a rotor at its limit
 ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
 WORST = 4.0  # times that of `oracle` a flight counts at most
@@ -75,7 +74,7 @@ class Part(NamedTuple):
     @property
     def undisturbed(self) -> Part:
         """The same flights as `oracle` flies them."""
-        return self._replace(scenarios=[dataclasses.replace(one, disturbance=Disturbance()) for one in self.scenarios])
+        return self._replace(scenarios=[with_perfect_sensors(one) for one in self.scenarios])
 
 
 class Measured(NamedTuple):
@@ -86,22 +85,31 @@ class Measured(NamedTuple):
     peak: np.ndarray  # largest |e_o| in the last third [m]
 
 
-def flights_of(track: str, condition: str, count: int, plants: int | None = None) -> list[Part]:
-    """The flights of a search: `count` on each plant of a `track`; both conditions fly the same loads and goals.
+def flights_of(tracks: Sequence[str], condition: str, count: int, plants: int | None = None) -> list[Part]:
+    """The flights of a search: `count` in each condition on each plant of `tracks`, those that `oracle` succeeds in.
 
-    `plants`: this many of the track, evenly spaced; None: all.
+    `plants`: this many of each track, evenly spaced; None: all.
     """
-    worlds, parts = worlds_of(track, DRAW), []
-    for world in worlds if plants is None else worlds[:: len(worlds) // plants]:
-        length = CRAZYFLIE_LENGTH if track == "crazyflie" else world.length
-        chosen = [
-            (dataclasses.replace(one, seconds=SECONDS), bound * length, name)
-            for number, (name, bound) in enumerate(BOUNDS.items())
-            if condition in (name, "both")
-            for one in [pair[number] for pair in world.scenarios[:count]]
-        ]
-        scenarios, bounds, names = zip(*chosen, strict=True)
-        parts.append(Part(world.config, scenarios, np.array(bounds), np.array(names)))
+    parts = []
+    for track in tracks:
+        groups = groups_of(track, DRAW)
+        for group in groups if plants is None else groups[:: max(len(groups) // plants, 1)]:
+            chosen = [
+                one
+                for name in CONDITIONS
+                if condition in (name, "both")
+                for one in [flight for flight in group.flights if flight.condition == name][:count]
+            ]
+            scenarios = [
+                dataclasses.replace(
+                    one.scenario,
+                    seconds=SECONDS,
+                    disturbance=dataclasses.replace(one.scenario.disturbance, seed=number),
+                )
+                for number, one in enumerate(chosen)
+            ]
+            bounds, names = np.array([one.radius for one in chosen]), np.array([one.condition for one in chosen])
+            parts.append(Part(group.config, scenarios, bounds, names))
     return parts
 
 
@@ -150,13 +158,14 @@ class Flown:
         flown = scenario_arrays(part.config, part.scenarios)
         config = part.config
         step = make_plant_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
-        loop = ClosedLoop(config, (scalar_form if config.autopilot.kind == "ideal" else jax.vmap)(step), flown.sensors)
+        whole = (scalar_form if config.autopilot.kind == "ideal" else jax.vmap)(step)
+        loop = ClosedLoop(config, whole, flown.sensors, jitters=flown.inputs.late is not None)
         privileged, most = make_privileged_info(config), rotor_limits(config.plant, part.scenarios)
         total = len(flown.inputs.time)
 
         def fly(arrays: Any, load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> Any:
             controller = self._tuned.make(config, arrays)
-            state, observation = loop.start(start, inputs.goal[0], first, flown.delays)
+            state, observation = loop.start(start, inputs.at(0).goal, load, first, flown.settings)
             zero = jnp.zeros_like(start.time)
 
             def advance(carried: Any, now: Inputs) -> tuple[Any, None]:
@@ -299,8 +308,8 @@ def main() -> None:
     """Search, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("controller", choices=TUNED)
-    parser.add_argument("--track", default="pair", help="whose plants and loads fly")
-    parser.add_argument("--condition", choices=(*BOUNDS, "both"), default="both")
+    parser.add_argument("--track", nargs="+", default=["pair"], choices=TRACKS, help="whose plants and loads fly")
+    parser.add_argument("--condition", choices=(*CONDITIONS, "both"), default="both")
     parser.add_argument("--flights", type=int, default=FLIGHTS, help="of each plant")
     parser.add_argument("--plants", type=int, help="of the track; all if not given")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
