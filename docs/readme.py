@@ -24,10 +24,10 @@ README = REPOSITORY / "README.md"
 BLOCK = re.compile(r"(?<=<!-- docs/readme.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
 TRACKS = {"pair": "mass known", "pair-unknown": "mass unknown"}
 CLASSICAL = {
-    "copy": "`copy`: the PD controller alone, optimum of the paper's reward",
+    "copy": "`copy`: the PD controller alone",
     "adaptive": "`adaptive`",
     "pid": "`pid`",
-    "observer": "`observer`: PD, disturbance observer",
+    "observer": "`observer`",
     "mpc": "`mpc`",
     "lqg": "`lqg`",
 }
@@ -62,7 +62,7 @@ def best(found: dict[str, Tracks], names: Iterable[str], track: str) -> str:
     if not most:
         return ""
     share = shown(found[most[0]], track, "success %").partition("/")[2]
-    return f"{' and '.join(f'`{name}`' for name in most)} ({share} %)"
+    return f"{', '.join(f'`{name}`' for name in most)} ({share} %)"
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
@@ -71,9 +71,7 @@ def sentences(found: dict[str, Tracks]) -> list[str]:
     for track, title in TRACKS.items():
         classical, trained = (best(found, names, track) for names in (CLASSICAL, TRAINED))
         if classical and trained:
-            said.append(
-                f"In the world, {title}, {trained} succeeds most often of the learned, {classical} of the others."
-            )
+            said.append(f"Most successful in the world, {title}: learned {trained}, classical {classical}.")
     with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
         parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
     said.append(f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1))
