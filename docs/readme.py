@@ -1,82 +1,98 @@
 #!/usr/bin/env python3
 """The block of README.md between `<!-- docs/readme.py -->` and `<!-- end -->`, made of the leaderboard's entries.
 
-`python docs/readme.py` rewrites it.
+`python docs/readme.py` rewrites it. A follower without an entry has no row.
 """
 
 from __future__ import annotations
 
-import json
 import re
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from leaderboard import entries
+
+from mjxball.bench import CONDITIONS
+from mjxball.bench.entry import HEADS, cells
+from mjxball.running import run_command
 
 REPOSITORY = Path(__file__).parents[1]
 README = REPOSITORY / "README.md"
 BLOCK = re.compile(r"(?<=<!-- docs/readme.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
-FOLLOWERS = {
-    "copy": "`copy`: the PD controller alone, optimum of the paper's reward",
+TRACKS = {"pair": "mass known", "pair-unknown": "mass unknown"}
+CLASSICAL = {
+    "copy": "`copy`: the PD controller alone",
     "adaptive": "`adaptive`",
     "pid": "`pid`",
-    "observer": "`observer`: PD, disturbance observer",
-    "lqg-offset-free": "`lqg-offset-free`",
+    "observer": "`observer`",
     "mpc": "`mpc`",
-    "lqg-slow": "`lqg-slow`",
-    "sac": "**`sac`**: learned by SAC",
-    "balance": "**`balance`**: learned by gradients",
+    "lqg": "`lqg`",
 }
-TEXT = """
-follower | settles to 2 % [s] | 90 % of peaks below [mm] | success [%] | mass unknown [%] | rotor at its limit [%]
----|---|---|---|---|---
-{table}
+TRAINED = {"sac": "**`sac`**: learned by SAC", "balance": "**`balance`**: learned by gradients"}
+MINUTE = "transport-sac"  # what README trains
+COLUMNS = (
+    *("follower", "success [%]", "mass unknown [%]", "arrival over the oracle's", "90 % of late errors below [mm]"),
+    "rotor at its limit [%]",
+)
 
-`balance` settles soonest, undisturbed sways least, and serves known and unknown masses with one set of {parameters}
-weights. Under noise its commands change by {own:.0f} mrad a step, those of the others that settle within 3 s by
-{least:.0f} to {most:.0f}; of these `{sparing}` spares the rotors most. Of classical controllers `lqg-slow` succeeds
-most often, where it knows the mass. The training below succeeds in {first:.0f} %.
-
-"""
+Tracks = dict[str, dict[str, Any]]  # an entry's results of each track and condition
 
 
-def tracks_of(name: str) -> dict[str, Any]:
-    """Tracks of a follower's entry."""
-    return json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())["tracks"]
+def shown(tracks: Tracks, track: str, head: str) -> str:
+    """calm/world of one column of the leaderboard; a dash if the track was not flown."""
+    if track not in tracks:
+        return "-"
+    return "/".join(dict(zip(HEADS, cells(tracks[track][one]), strict=True))[head] for one in CONDITIONS)
 
 
-def cell(track: dict[str, Any], key: str, factor: float, digits: int) -> str:
-    """Undisturbed/disturbed."""
-    values = [track[condition][key] for condition in ("undisturbed", "disturbed")]
-    return "/".join("never" if value is None else f"{factor * value:.{digits}f}" for value in values)
-
-
-def row(name: str) -> str:
+def row(text: str, tracks: Tracks) -> str:
     """One line of the table."""
-    known, unknown = (tracks_of(name)[track] for track in ("pair", "pair-unknown"))
-    columns = (("settling_50", 1, 2), ("peak_90", 1e3, 0), ("met", 100, 0))
-    cells = [cell(known, *column) for column in columns]
-    return " | ".join([FOLLOWERS[name], *cells, cell(unknown, "met", 100, 0), cell(known, "rotors_at_limit", 100, 1)])
+    columns = (("pair", "success %"), ("pair-unknown", "success %"))
+    columns += (("pair", "arrival"), ("pair", "late mm"), ("pair", "limit %"))
+    return " | ".join([text, *(shown(tracks, *column) for column in columns)])
+
+
+def best(found: dict[str, Tracks], names: Iterable[str], track: str) -> str:
+    """Those of `names` that succeed most often in the world, and how often; empty if none has flown the track."""
+    succeeded = {name: found[name][track]["world"]["succeeded"] for name in names if track in found.get(name, {})}
+    most = [name for name, count in succeeded.items() if count == max(succeeded.values())]
+    if not most:
+        return ""
+    share = shown(found[most[0]], track, "success %").partition("/")[2]
+    return f"{', '.join(f'`{name}`' for name in most)} ({share} %)"
+
+
+def sentences(found: dict[str, Tracks]) -> list[str]:
+    """What the entries say, true whatever their values are."""
+    said = []
+    for track, title in TRACKS.items():
+        classical, trained = (best(found, names, track) for names in (CLASSICAL, TRAINED))
+        if classical and trained:
+            said.append(f"Most successful in the world, {title}: learned {trained}, classical {classical}.")
+    with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
+        parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
+    said.append(f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1))
+    if "pair" in found.get(MINUTE, {}):
+        said.append(f"The training below succeeds in {shown(found[MINUTE], 'pair', 'success %')} %.")
+    return said
 
 
 def block() -> str:
     """The text of the block."""
-    found = {name: tracks_of(name)["pair"]["disturbed"] for name in FOLLOWERS}
-    quick = {name: one for name, one in found.items() if (one["settling_50"] or 99) <= 3}
-    changes = {name: 1e3 * one["command_change"] for name, one in quick.items()}
-    own = changes.pop("balance")
-    with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
-        parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
-    return TEXT.format(
-        table="\n".join(map(row, FOLLOWERS)),
-        parameters=f"{parameters:,}".replace(",", " "),
-        own=own,
-        least=min(changes.values()),
-        most=max(changes.values()),
-        sparing=min(quick, key=lambda name: quick[name]["rotors_at_limit"]),
-        first=100 * tracks_of("transport-sac")["pair"]["undisturbed"]["met"],
-    )
+    found = {entry["follower"]: entry["tracks"] for entry in entries()}
+    rows = [row(text, found[name]) for name, text in (CLASSICAL | TRAINED).items() if name in found]
+    table = [" | ".join(COLUMNS), "|".join(["---"] * len(COLUMNS)), *rows]
+    return "\n".join(["", *table, "", *sentences(found), "", ""])
+
+
+def main() -> int:
+    """Rewrite the block."""
+    README.write_text(BLOCK.sub(lambda _: block(), README.read_text()))
+    return 0
 
 
 if __name__ == "__main__":
-    README.write_text(BLOCK.sub(block(), README.read_text()))
+    sys.exit(run_command(main))

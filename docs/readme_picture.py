@@ -58,7 +58,7 @@ def main() -> None:
     followers = []
     for name, text, controller in (
         ("copy", "PD controller alone", make_baseline("copy", config)),
-        ("lqg-offset-free", "classical controller", make_baseline("lqg-offset-free", config)),
+        ("lqg", "classical controller", make_baseline("lqg", config)),
         ("balance", "trained network", Policy.load(shipped_policy("balance"))),
     ):
         colour = ImageColor.getrgb(LOOKS[name][0])

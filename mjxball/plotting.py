@@ -24,9 +24,9 @@ SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(
 TABLE = (
     (SOLID, ("stand", "flight", "balance", "universal", "sac", "flight-upgrade")),
     (DASH_DOT_DOT, ("", "robust", "", "transport", "flight-brushless", "paper")),
-    (DASH, ("lqg-offset-free", "lqg-slow-known-rig", "lqg-known-failures", "lqg-known-rig", "lqg-slow", "lqg")),
+    (DASH, ("", "", "", "", "", "lqg")),
     (DASH_DOT, ("mpc", "copy", "pid", "adaptive", "observer", "adaptive-mass")),
-    (DOT, ("oracle", "", "memoryless", "", "random", "stay")),
+    (DOT, ("oracle", "", "", "", "random", "stay")),
 )
 LOOKS = {
     name: (colour, dash, MARKERS[colour])

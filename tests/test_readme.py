@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -13,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from bench.entries import known, reasons, results
 from command_line import REPOSITORY, TINY, environment
 from packaging.requirements import Requirement
 
 sys.path.append(str(REPOSITORY / "docs"))
+import leaderboard
 from readme import BLOCK, block
 
 README = (REPOSITORY / "README.md").read_text()
@@ -41,6 +44,43 @@ LONG = ("--algorithm gradient", "--plant team3", "--distributed", "eval.py bench
 
 def test_the_block_of_the_leaderboard_is_what_its_script_writes() -> None:
     assert BLOCK.search(README)[0] == block()
+
+
+@pytest.fixture
+def entered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Lets the block be made of these entries, by the follower's name."""
+
+    def enter(**tracks: dict[str, Any]) -> str:
+        for name, flown in tracks.items():
+            (tmp_path / f"{name}.json").write_text(json.dumps(known(follower=name, tracks=flown)))
+        leaderboard.entries.cache_clear()
+        return block()
+
+    monkeypatch.setattr(leaderboard, "ENTRIES", tmp_path)
+    yield enter
+    leaderboard.entries.cache_clear()
+
+
+def test_the_block_has_a_row_for_every_entry_and_names_the_best(entered: Any) -> None:
+    usual = {"calm": results(), "world": results(late_error_90=0.018)}
+    better = {**usual, "world": {**reasons(rotors=9), "succeeded": 101, "late_error_90": 0.018}}
+    empty = entered()
+    text = entered(copy={"pair": usual}, lqg={"pair": better, "pair-unknown": usual}, balance={"pair": usual})
+    rows = [line.split(" | ") for line in text.splitlines() if line.count(" | ")]
+    assert [row[0].strip("*`").partition("`")[0] for row in rows] == ["follower", "copy", "lqg", "balance"]
+    assert rows[2][1:] == ["83/84", "83/83", "1.10/1.10", "8.0/18.0", "2.0/2.0"]
+    assert rows[1][2] == "-"  # a track that was not flown
+    assert "in the world, mass known: learned `balance` (83 %), classical `lqg` (84 %)." in text
+    assert text.count("in the world") == 1  # nothing learned has flown with an unknown mass
+    assert len(text.splitlines()) == len(empty.splitlines()) + 4
+    assert "in the world" not in empty
+
+
+def test_the_block_names_all_that_are_best(entered: Any) -> None:
+    usual = {"pair": {"calm": results(), "world": results(late_error_90=0.018)}}
+    text = entered(**dict.fromkeys(("pid", "lqg", "sac", "transport-sac"), usual))
+    assert "in the world, mass known: learned `sac` (83 %), classical `pid`, `lqg` (83 %)." in text
+    assert "The training below succeeds in 83/83 %." in text
 
 
 def needed(extra: str) -> set[str]:

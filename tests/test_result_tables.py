@@ -40,43 +40,6 @@ def stability() -> Iterator[tuple[str, Numbers]]:
     yield "22 of 22", [*worst, error, found["failed"], *peaks]
 
 
-def teams() -> Iterator[tuple[str, Numbers]]:
-    found = measured("teams")["rows"]
-    for drones in range(2, 7):
-        ours, offset, lqg = (
-            one(found, drones=drones, follower=name) for name in ("universal", "lqg-offset-free", "lqg")
-        )
-        three = (ours, offset, lqg)
-        met = [100 * row["both"] for row in (ours, offset)]
-        peaks = [1e3 * row["plane_peak_median"] for row in three]
-        yield f"{drones}", [*met, *peaks, *(row["settling_median"] for row in three)]
-
-
-def rigs() -> Iterator[tuple[str, Numbers]]:
-    found = measured("rigs")
-    for drones in range(2, 7):
-        three = [
-            one(found["rows"], drones=drones, follower=name)
-            for name in ("universal", "lqg-known-rig", "lqg-slow-known-rig")
-        ]
-        ours, failed = three[0], [100 * row["failed"] for row in three]
-        peaks = [1e3 * row["peak_50"] for row in three]
-        alone = ours["crashed_alone_flights"]
-        yield f"{drones}", [*failed, alone, 100 * ours["met"], 100 * ours["sooner"], *peaks]
-    names, every = ("universal", "lqg-known-rig", "lqg-slow-known-rig"), found["all"]["universal"]
-    yield (
-        "all",
-        [3000 * every["failed"], 3000, 3000 * every["crashed_alone"], 100 * every["met"], 100 * every["sooner"]],
-    )
-    for seed in ("5101", "5102"):
-        every = measured("rigs_fresh")[f"seed {seed}"]["all"]
-        alone = 900 * every["universal"]["crashed_alone"]
-        yield f"300, seed {seed}", [*(100 * every[name]["met"] for name in names), alone, 900]
-    for drones, word in ((7, "seven"), (8, "eight")):
-        three = [one(measured("rigs_7_8")["rows"], drones=drones, follower=name) for name in names]
-        yield f"60 of {word}", [*(100 * row["met"] for row in three), three[0]["crashed_alone_flights"], 180]
-
-
 def minutes() -> Iterator[tuple[str, Numbers]]:
     found = [row for row in measured("horizon")["rows"] if row["seconds"] == 600]
     for name, policy, plant in (
@@ -142,8 +105,6 @@ def onboard() -> Iterator[tuple[str, Numbers]]:
 SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "All seeds": ("results", seeds),
     "Stability": ("results", stability),
-    "Teams": ("results", teams),
-    "Any rig": ("results", rigs),
     "Ten minutes": ("results", minutes),
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),

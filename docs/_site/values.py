@@ -30,7 +30,6 @@ from mjxball.plant.trim import largest_amplitude  # noqa: E402
 from mjxball.policy import file  # noqa: E402
 from mjxball.policy.formats.c_header import weight_bytes  # noqa: E402
 from mjxball.sim import disturbances  # noqa: E402
-from mjxball.sim.rigs import HELD_OUT_RIGS  # noqa: E402
 from mjxfly.limits import Limits, Times  # noqa: E402
 from mjxfly.margins import REQUIREMENTS, gains_of  # noqa: E402
 from mjxfly.mocap_supervision import MocapLimits  # noqa: E402
@@ -40,7 +39,7 @@ from mjxfly.twin.conditions import Battery  # noqa: E402
 from mjxfly.twin.coupled import WORN_SAG  # noqa: E402
 
 MODULES = (  # known by their last name
-    *("horizon", "rigs", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
+    *("horizon", "math", "mjxball.config", "mjxball.xla", "mjxball.control.crazyflie"),
     *(
         "mjxball.control.network_interface",
         "mjxball.control.motors",
@@ -119,7 +118,6 @@ NAMES: dict[str, Any] = {
     "C": SimpleNamespace(**{name: float(value) for name, value in defined}),  # of the apps on board
     "axes": axes,
     "hover": hover,
-    "HELD_OUT_RIGS": HELD_OUT_RIGS,
     "autopilot": Autopilot(),
     "limits": Limits(),
     "times": Times(),

@@ -23,7 +23,7 @@ from mjxball.reading import parse_json
 
 BASELINES = Path(__file__).parents[1] / "baselines"
 TYPES = {"observation": "tensor(float)", "memory": "tensor(float)", "start": "tensor(bool)"}  # of inputs
-UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # with privileged information, or no controllers
+UNRANKED = {"oracle", "stay", "random"}  # with privileged information, or no controllers
 
 
 def entrant(text: str) -> tuple[str, FollowerFactory]:

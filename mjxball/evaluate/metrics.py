@@ -32,7 +32,6 @@ class Metrics:
     plane_peak: float | None  # largest hypot(e_x, e_y) at t >= 20 s [m]
     max_tilt: float | None  # largest hypot(roll, pitch) [rad]
     action_error: float | None  # rms over time, followers and (roll, pitch, az) of follower minus leader command
-    settling_time_10: float | None  # as settling_time, for 10 % [s]
     paper_return: float | None  # the paper's reward, summed over the first 1000 steps (20 s)
     effort: float | None  # rms deviation of the followers' rotor forces from those at the start, hover [N]
     smoothness: float | None  # rms change of the followers' pitch and roll commands from step to step [rad]
@@ -68,12 +67,12 @@ def results(running: RunningMetrics) -> list[Metrics]:
         goal = np.where(t.target == 0, np.nan, t.target)
         over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / np.abs(goal))
         last = t.time - NEVER_WITHIN - ROUNDING
-        settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
-        settled = np.where(t.outside >= last[..., None], np.nan, settled)
+        settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg)
+        settled = np.where(t.outside >= last, np.nan, settled)
         arrival = np.where(np.isnan(t.radius) | (t.beyond >= last), np.nan, np.fmax(t.beyond, 0.0))
         columns = {
             "rmse": np.sqrt(square / t.early),
-            "settling_time": settled[:, 0],
+            "settling_time": settled,
             "overshoot": np.fmax.reduce(over, axis=1) - 1,
             "x_peak": peaks[:, 0],
             "y_peak": peaks[:, 1],
@@ -81,7 +80,6 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "plane_peak": peaks[:, 3],
             "max_tilt": t.tilt,
             "action_error": np.sqrt(difference / t.steps),
-            "settling_time_10": settled[:, 1],
             "paper_return": returned,
             "effort": np.sqrt(effort / t.steps),
             "smoothness": np.sqrt(change / np.maximum(t.steps - 1, 1)),

@@ -13,7 +13,7 @@ RMSE_UNTIL = 20.0  # [s]
 PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
 STEADY_AFTER = 20.0  # [s]
 WAYPOINT_SECONDS = 10.0  # [s] after the last waypoint became the goal, before which nothing is steady
-SETTLED = (0.02, 0.10)  # of the error at the start of the last leg
+SETTLED = 0.02  # of the error at the start of the last leg
 SATURATED_WITHIN = 1e-6  # of the largest rotor force
 # Likewise: a lagging rotor comes this near within 0.14 s, and to the exact limit only if it is asked for much longer.
 AT_LIMIT_WITHIN = 0.01
@@ -33,7 +33,7 @@ class RunningMetrics(NamedTuple):
     leg: Array  # when the last waypoint became the goal [s]
     steady_from: Array  # [s]
     steady: Array  # steps in steady state
-    outside: Array  # (n, 2) last time |e_o| was beyond 2 % and 10 %, -inf: never [s]
+    outside: Array  # last time |e_o| was beyond `SETTLED`, -inf: never [s]
     peaks: Array  # (n, 4) x, y, z and the plane, NaN before the first
     furthest: Array  # (n, 3) along each axis towards the goal [m]
     tilt: Array
@@ -75,7 +75,7 @@ def begin(
         leg=zero,
         steady_from=zero + STEADY_AFTER,
         steady=zero,
-        outside=xp.full_like(position[:, :2], -xp.inf),
+        outside=zero - xp.inf,
         peaks=no_peaks,
         furthest=none,
         tilt=zero,
@@ -111,8 +111,7 @@ def update(
     initial = xp.where(new, distance, running.initial)
     steady_from = xp.where(new, row.time + WAYPOINT_SECONDS, running.steady_from)
     steady_from = xp.where(steady_from > STEADY_AFTER, steady_from, STEADY_AFTER)
-    outside = xp.where(new[:, None], -xp.inf, running.outside)
-    beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
+    outside = xp.where(new, -xp.inf, running.outside)
     peaks = xp.where(new[:, None], xp.nan, running.peaks)
     steady = row.time >= steady_from - TINY
     errors = xp.concat([xp.abs(error), xp.hypot(error[:, :1], error[:, 1:2])], axis=-1)
@@ -132,7 +131,7 @@ def update(
         leg=xp.where(new, row.time, running.leg),
         steady_from=steady_from,
         steady=xp.where(new, 0.0, running.steady) + xp.where(steady, 1.0, 0.0),
-        outside=xp.where(beyond, row.time, outside),
+        outside=xp.where(distance <= SETTLED * initial, outside, row.time),
         peaks=xp.where(steady[:, None], xp.fmax(peaks, errors), peaks),
         furthest=xp.fmax(running.furthest, row.position * xp.sign(row.target)),
         tilt=xp.fmax(running.tilt, xp.hypot(row.euler[:, 0], row.euler[:, 1])),

@@ -7,7 +7,6 @@ drone of 3 kg. Random factors apply on top. Needs NumPy alone.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -46,8 +45,7 @@ UNSATURATED_TILT = 0.15  # smallest step that rotors must answer without saturat
 LEAST_DAMPING = 0.3  # of the attitude loops with rotor lag; a rig with less is rejected
 # While the CG's reach is below a tenth of the rig's length, believed mass and thrusts are moved towards the truth by
 # three tenths, at most 8 times. A rig with a reach below a fiftieth is rejected.
-TRAINING, HELD_OUT = 1, 2  # seeds
-HELD_OUT_RIGS = 200  # of each number of drones
+TRAINING = 1  # seed
 SHRINKS, ENOUGH_REACH, LEAST_REACH = 8, 0.1, 0.02
 
 
@@ -113,12 +111,6 @@ def training_rigs(config: Config) -> RigTable:
         return np.asarray(part, np.float32).reshape(*shape, *part.shape[1:])
 
     return RigTable(_each(folded, table.parameters), *(folded(part) for part in table[1:]))
-
-
-@functools.lru_cache(maxsize=16)
-def held_out(config: Config, size: int, count: int = HELD_OUT_RIGS) -> RigTable:
-    """`count` rigs of `size` drones that no training uses, without padding; another `count` gives other rigs."""
-    return unpadded(sample_rigs(config, size, count, HELD_OUT).rigs, size)
 
 
 def concatenated(tables: list[RigTable]) -> RigTable:

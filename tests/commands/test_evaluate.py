@@ -184,7 +184,7 @@ def test_baselines_beside_a_policy_for_crazyflies_fly_its_plant(
     assert call(main, [path, "--followers", "copy", *FAST, "--seconds", 3, "--json", out]) == 0
     assert [(cell["follower"], cell["mass"]) for cell in cells_of(out)] == [("copy", 0.0175), ("flight", 0.0175)]
     capsys.readouterr()
-    assert call(main, [path, "--followers", "memoryless"]) == 2
+    assert call(main, [path, "--followers", "pid"]) == 2
     assert "this plant is another" in capsys.readouterr().err
 
 

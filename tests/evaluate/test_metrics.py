@@ -73,7 +73,6 @@ def test_exponential_approach() -> None:
     # Samples of exp(-2 t): their mean over 20 s is 1 / 40 up to the sampling's end effects.
     assert found.rmse == pytest.approx(distance * np.sqrt(np.mean(np.exp(-2 * TIME[:1001]))))
     assert found.settling_time == pytest.approx(np.floor(np.log(50) / 0.02) * 0.02)
-    assert found.settling_time_10 == pytest.approx(np.floor(np.log(10) / 0.02) * 0.02)
     assert found.overshoot == pytest.approx(-np.exp(-30.0), abs=1e-9)
     assert (found.x_peak, found.y_peak) == pytest.approx((np.exp(-20.0), 2 * np.exp(-20.0)))
     assert (found.z_peak, found.max_tilt, found.action_error, found.paper_return) == (0, 0, 0, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from typing import Any
 
@@ -11,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxball.baselines.lqg import Lqg
+from mjxball.bench.tracks import TRACKS, candidate
 from mjxball.config import Config, preset, replace, validate, with_plant
 from mjxball.control import rotations
-from mjxball.control.followers import PrivilegedInfo
-from mjxball.control.observation import mount_angles, mount_frames
+from mjxball.control.observation import mount_frames
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
+from mjxball.evaluate.metrics import measure
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_plant_step
@@ -29,7 +30,7 @@ from mjxball.sim.outside import outside
 from mjxball.sim.rigs import (
     LEAST_DAMPING,
     TRAINING,
-    held_out,
+    RigTable,
     loop_damping,
     rig_config,
     sample_rigs,
@@ -39,15 +40,21 @@ from mjxball.sim.rigs import (
 )
 from mjxball.sim.rollout import load_of, simulate, start_of
 from mjxball.sim.scenario import Scenario
-from random_rigs import AnyRigController, fly_random_rigs, rig_controllers, stacked
 
 UNIVERSAL = preset("universal")
 POLICY = shipped_policy("universal")
+OTHERS = 2  # seed of rigs that no training samples
+
+
+@functools.cache
+def other_rigs(size: int, count: int) -> RigTable:
+    """`count` rigs of `size` drones that no training samples, without padding."""
+    return unpadded(sample_rigs(UNIVERSAL, size, count, OTHERS).rigs, size)
 
 
 def test_a_row_is_the_plant_of_its_configuration() -> None:
     for size in (2, 4):
-        rigs = held_out(UNIVERSAL, size, 3)
+        rigs = other_rigs(size, 3)
         for row in range(3):
             config = rig_config(UNIVERSAL, rigs, row)
             found = plant_parameters(config.plant, config.attitude)
@@ -65,7 +72,7 @@ def test_draws_are_seeded_within_their_ranges_and_never_those_of_training() -> N
     assert drawn.candidates == again.candidates
     assert drawn.unstable > 0
     np.testing.assert_array_equal(drawn.rigs.reach, again.rigs.reach)
-    assert not np.isin(held_out(UNIVERSAL, 3, 40).reach, drawn.rigs.reach).any()
+    assert not np.isin(other_rigs(3, 40).reach, drawn.rigs.reach).any()
     for row in range(40):
         assert not outside(rig_config(UNIVERSAL, drawn.rigs, row), UNIVERSAL)
     for axis in (0, 1):
@@ -85,7 +92,7 @@ def test_damping_is_that_of_the_roots() -> None:
 def test_followers_can_hold_every_load_as_far_as_it_goes() -> None:
     margin = UNIVERSAL.scenario.trim_margin
     for size in (2, 3, 6):
-        rigs = held_out(UNIVERSAL, size, 8)
+        rigs = other_rigs(size, 8)
         for row in range(8):
             plant, thrust = rig_config(UNIVERSAL, rigs, row).plant, tuple(rigs.thrust[row])
             for angle in np.linspace(0, 2 * np.pi, 5):
@@ -95,26 +102,13 @@ def test_followers_can_hold_every_load_as_far_as_it_goes() -> None:
 
 
 def test_a_wrong_belief_takes_from_what_tilt_commands_hold() -> None:
-    rigs = held_out(UNIVERSAL, 3, 8)
+    rigs = other_rigs(3, 8)
     numbers, load, full = whole(rigs.parameters, 9.81), rigs.object_mass, np.ones_like(rigs.thrust)
     right, less, more = (trimmed_reach(numbers, load, k * load, full, 0.15, 0.01, 6.0) for k in (1.0, 0.9, 1.1))
     held = 0.85 * 0.01 * 2 * numbers.gains.kp[:, :2].min(axis=1)  # by two followers, of limits of 0.01 rad
     np.testing.assert_allclose(right, held / (9.81 * load), rtol=1e-12)
     assert (less < right).all()
     assert (more < right).all()
-
-
-def test_rig_laws_fly_together_as_each_alone() -> None:
-    rigs = held_out(UNIVERSAL, 3, 3)
-    controllers = rig_controllers(UNIVERSAL, rigs, Lqg)
-    numbers, rebuild = stacked(controllers)
-    random = np.random.default_rng(0)
-    observation = 0.1 * random.standard_normal((2, 18))
-    for row, controller in enumerate(controllers):
-        known = PrivilegedInfo(np.full(2, 0.3), None, None, np.full(2, 4.0), np.ones((2, 3)))
-        alone = controller.step(controller.start(observation), observation, known)[1]
-        together = rebuild([part[row] for part in numbers])
-        np.testing.assert_array_equal(together.step(together.start(observation), observation, known)[1], alone)
 
 
 @pytest.mark.release
@@ -178,21 +172,22 @@ def test_thrust_falls_as_the_battery_empties() -> None:
         assert flown.velocity[0, 2] == pytest.approx(expected, rel=1e-4, abs=1e-4)
 
 
-def known_team(config: Config) -> tuple[float, np.ndarray, np.ndarray]:
-    """N / (N - 1) of a team, and in each follower's mount frame (F, 2) the roll and pitch command of a unit of lift
-    [rad s2/m], and the room of its commands before its rotors saturate [rad].
+def true_geometry(config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """Of the followers of a rig, each in its mount frame: lever (F, 2) and room (F,).
+
+    Lever: angular acceleration about roll and pitch per 1 m/s2 that the follower lifts more than the leader [1/m].
+    Room: that about pitch at which its rotors saturate, with all other drones turning alike [1/s2].
     """
-    plant, params = config.plant, plant_parameters(config.plant, config.attitude)
-    lifted = params.known_mass + params.load_share * plant.object_mass
-    (x, y), kp, count = params.mounts[plant.leader, :2], params.gains.kp[:2], plant.count
-    angles, hover = mount_frames(plant), plant.gravity * lifted / 4
-    held = np.append(np.array([-y, x]) * lifted[plant.leader] / count / kp, 0.0)
-    held = np.broadcast_to(held, (*np.shape(angles), 3))
-    followers = list(plant.followers) if len(plant.followers) > 1 else plant.followers[0]
-    most = (2 * params.arm * np.minimum(hover, params.rotor_force_max - hover))[followers]
+    plant, found = config.plant, plant_parameters(config.plant, config.attitude)
+    lifted = found.known_mass + found.load_share * plant.object_mass
+    inertia = plant.count * found.gains.kp[:2] / np.square(config.attitude.natural_frequency[:2])
+    x, y = found.mounts[plant.leader, :2]
+    angles, hover = np.atleast_1d(mount_frames(plant)), plant.gravity * lifted / 4
+    lever = np.append(np.array([-y, x]) * lifted[plant.leader] / inertia, 0.0)
+    most = (2 * found.arm * np.minimum(hover, found.rotor_force_max - hover))[list(plant.followers)]  # [N m]
     along, across = np.cos(angles) ** 2, np.sin(angles) ** 2
-    room = np.stack([most / (along * kp[0] + across * kp[1]), most / (along * kp[1] + across * kp[0])], axis=-1)
-    return count / (count - 1), rotations.turned_about_z(held, -angles)[..., :2], room
+    room = plant.count * most / (along * inertia[1] + across * inertia[0])
+    return rotations.turned_about_z(np.broadcast_to(lever, (len(angles), 3)), -angles)[:, :2], room
 
 
 class TestUniversal:
@@ -200,16 +195,14 @@ class TestUniversal:
         """Against what followers that know the whole rig know: medians of the rigs, their spread and direction."""
         for size in (2, 3, 4, 6):
             levers, rooms, turned = [], [], []
-            rigs = held_out(UNIVERSAL, size, 40)
+            rigs = other_rigs(size, 40)
             for row in range(40):
                 config = rig_config(UNIVERSAL, rigs, row)
-                ratio, *whole = known_team(config)
-                lever, room = (np.atleast_2d(part) for part in whole)
+                lever, room = true_geometry(config)
                 guessed = np.atleast_2d(geometry_of(config.plant))
-                np.testing.assert_allclose(guessed[:, 0], ratio)
-                stiffness = np.square(config.attitude.natural_frequency[:2])
-                levers.append(np.hypot(*(lever * stiffness).T) / np.hypot(*guessed[:, 1:3].T))
-                rooms.append(room[:, 1] * stiffness[1] / guessed[:, 3])
+                np.testing.assert_allclose(guessed[:, 0], size / (size - 1))
+                levers.append(np.hypot(*lever.T) / np.hypot(*guessed[:, 1:3].T))
+                rooms.append(room / guessed[:, 3])
                 turned.append(np.arctan2(*lever.T) - np.arctan2(guessed[:, 1], guessed[:, 2]))
             assert np.median(levers) == pytest.approx(1.0, abs=0.15)
             assert np.median(rooms) == pytest.approx(1.0, abs=0.25)
@@ -220,43 +213,15 @@ class TestUniversal:
     @pytest.mark.slow
     @pytest.mark.parametrize("size", [2, pytest.param(5, marks=pytest.mark.release)])
     def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
-        rigs = held_out(UNIVERSAL, size, 4)
-        controller = AnyRigController(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
-        found = [one for own in fly_random_rigs(UNIVERSAL, rigs, controller, flights=2, seconds=21.0) for one in own]
+        rigs = [one for one in TRACKS["rigs"].flights(OTHERS) if one.config.plant.count == size][:4]
+        found = []
+        for plant, rig in enumerate(rigs):
+            scenario = candidate("rigs", OTHERS, plant, "calm", 0, rig.sample)
+            assert scenario is not None
+            flight = simulate(rig.config, load_policy(POLICY, rig.config), scenario, "newton-euler")
+            found.append(measure(flight, rig.config.scenario.termination_distance))
         assert not any(one.failed for one in found)
         assert np.median([one.peak for one in found]) < 0.1
-
-    @pytest.mark.release
-    def test_effort_is_what_followers_command_apart_and_what_rotors_give(self) -> None:
-        rigs, period = held_out(UNIVERSAL, 3).rows(slice(0, 8)), UNIVERSAL.timing.control_period
-
-        class Apart:
-            """Each follower tilts 0.02 rad in its mount frame; both lift against each other, by as much as `lift`."""
-
-            def __init__(self, lift: float):
-                self.commands = jnp.array([[0.02, 0.0, lift], [-0.02, 0.0, -lift]])
-
-            def start(self, observation: Any) -> Any:
-                return ()
-
-            def step(self, memory: Any, observation: Any, known: Any) -> Any:
-                return memory, jnp.broadcast_to(self.commands, (*observation.shape[:-2], 2, 3))
-
-        flown = [fly_random_rigs(UNIVERSAL, rigs, Apart(lift), 2, 25 * period) for lift in (0.3, 8.0)]
-        calm, hard = ([one for own in found for one in own] for found in flown)
-        for row, one in enumerate(calm[::2]):
-            turned = mount_angles(rig_config(UNIVERSAL, rigs, row).plant)
-            # Half the distance between two vectors of 0.02 rad at those angles, over two axes.
-            assert one.command_spread == pytest.approx(
-                0.02 * abs(np.cos(np.diff(turned)[0] / 2)) / np.sqrt(2), rel=1e-3
-            )
-        limited = np.array([[one.rotors_at_limit for one in found] for found in (calm, hard)])
-        power = np.array([[one.rotor_power for one in found] for found in (calm, hard)])
-        assert (limited[1] >= limited[0]).all()
-        assert limited[1].mean() > limited[0].mean()
-        assert ((power[0] > 0.6) & (power[0] < 1.4)).all()
-        # Jensen: what is shared unevenly takes more power.
-        assert np.median(power[1]) > np.median(power[0])
 
     @pytest.mark.slow
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
