@@ -23,7 +23,8 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import times
-from mjxball.baselines.lqg import Costs, Feedback, feedback
+from mjxball.baselines.lqg import Feedback, feedback
+from mjxball.baselines.lqg_tuning import Costs
 from mjxball.baselines.sharing import Assumed, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
