@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NAME = "mpc"
 ALIKE = 1e-6  # largest difference of a team's drones
 SPARE = 0.04  # share of a rotor's largest force reserved for yaw and nonlinearities
-# PAIR is the best of 144 sets of `benchmarks/tuning.py mpc` on 6 loads, calm and rough: 1.23, as 2.8 before.
+# PAIR is the best of 144 sets of `benchmarks/tuning.py mpc` on 6 loads, calm and rough; its cost is 1.23.
 PAIR = Tuning(
     position=0.0911,
     velocity=0.362,

@@ -40,7 +40,7 @@ LOADS = (0.5, 2.0)  # masses of the load over the plant's with own gains, which 
 
 
 class OracleTuning(NamedTuple):
-    """Parameters of the controller: those of `Costs`, and the frequency at which it expects loads to swing."""
+    """Those of `Costs`, and the frequency at which it expects loads to swing: the best of 720 sets on 60 loads."""
 
     position: float = 0.03919
     velocity: float = 0.2003
