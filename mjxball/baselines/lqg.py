@@ -31,6 +31,7 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import regulator, riccati, times
+from mjxball.baselines.lqg_tuning import CALM, LONGEST_DELAY, TEAM, WORLD, Costs, Tuning
 from mjxball.baselines.sharing import Assumed, Wanted, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
@@ -40,94 +41,8 @@ if TYPE_CHECKING:
 
 POSITION_NOISE = 3e-3  # standard deviation of a measured error, to which the others refer [m]
 TILT_COST, VERTICAL_COST = 0.15, 1.0  # deviations of the mean command with a cost of 1 [rad], [m/s2]
-LONGEST_DELAY = 4  # control steps
+MEMORY, MOST_HALVINGS = 20.0, 24  # in which followers forget what they estimate apart [s]; tries to make it so
 ROWS = 14  # of `Feedback`
-
-
-class Costs(NamedTuple):
-    """What the LQR weighs, and limits of what it acts on."""
-
-    position: float  # horizontal error with a cost of 1 [m]
-    velocity: float  # and its rate [m/s]
-    height: float  # vertical error with a cost of 1 [m]
-    climb: float  # and its rate [m/s]
-    error_limit: float  # largest horizontal error that is acted on [m]
-    tilt_limit: float  # largest tilt that errors and rates ask for [rad]
-    height_limit: float  # largest vertical error that is acted on [m]
-    climb_limit: float  # largest vertical acceleration that errors and rates ask for [m/s2]
-
-
-class Tuning(NamedTuple):
-    """Parameters of the controller: those of `Costs`, and of the filter and its model."""
-
-    position: float = 0.0567
-    velocity: float = 0.294
-    height: float = 0.0497
-    climb: float = 0.256
-    error_limit: float = 0.425
-    tilt_limit: float = 0.379
-    height_limit: float = 0.205
-    climb_limit: float = 4.83
-    load_walk: float = 638  # noise intensity of the load torque's second derivative, over J [(rad/s4)2/s]
-    load_frequency: float = 1.05  # of the load's oscillation [rad/s]
-    load_damping: float = 0.0491  # of that oscillation
-    load_time: float = 31.4  # time constant with which its torque is forgotten [s]
-    wind_walk: float = 0.207  # noise intensity of the wind's acceleration [(m/s2)2/s]
-    wind_time: float = 56.5  # time constant with which it is forgotten [s]
-    lift_walk: float = 0.0112  # as of the wind, of errors of mass and thrust
-    lift_time: float = 70.2
-    acceleration_walk: float = 0.0129  # of every velocity [(m/s)2/s]
-    turn_walk: float = 0.0244  # of roll and pitch rate [(rad/s)2/s]
-    velocity_noise: float = 0.0283  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
-    angle_noise: float = 0.0027  # [rad]
-    rate_noise: float = 0.022  # [rad/s]
-    loop_scale: float = 0.993  # assumed factor on the attitude loops' natural frequency
-    delay: float = 0.859  # of the measurements, rounded [control steps]
-
-    @property
-    def costs(self) -> Costs:
-        """Those of the LQR."""
-        return Costs(*self[: len(Costs._fields)])
-
-    @property
-    def load(self) -> LoadModel:
-        """That of the disturbances."""
-        return LoadModel(self.load_frequency, self.load_damping, self.load_time, self.wind_time, self.lift_time)
-
-    @property
-    def late(self) -> int:
-        """Delay in control steps."""
-        return min(max(round(float(self.delay)), 0), LONGEST_DELAY)
-
-
-CALM = Tuning()
-WORLD = Tuning()
-# Of several followers, whose sensors and noises disagree: what each of them estimates must be forgotten.
-TEAM = Tuning(
-    position=0.0105,
-    velocity=0.175,
-    height=0.0194,
-    climb=0.853,
-    error_limit=0.168,
-    tilt_limit=0.885,
-    height_limit=0.204,
-    climb_limit=4.06,
-    load_walk=499,
-    load_frequency=4.55,
-    load_damping=0.436,
-    load_time=1.2,
-    wind_walk=0.00312,
-    wind_time=2.58,
-    lift_walk=0.00437,
-    lift_time=13.5,
-    acceleration_walk=0.00389,
-    turn_walk=0.374,
-    velocity_noise=0.0176,
-    angle_noise=0.00244,
-    rate_noise=0.0414,
-    loop_scale=1.1,
-    delay=1.9,
-)
 
 
 class Feedback(NamedTuple):
@@ -202,10 +117,41 @@ class LqgDesign(NamedTuple):
     sent: Float[Array, "... 5"]  # 1 for the input of that time, of the one now and the last four
     delay: Float[Array, "..."]  # control steps
     loop_scale: Float[Array, "..."]  # assumed factor on the attitude loops' frequency
+    commanded: Float[Array, "... 3 3"]  # what the mean command of all drones asks for
+    led_drive: Float[Array, "... 3 3"]  # and the leader's
 
 
 def design(config: Config, tuning: Tuning) -> LqgDesign:
-    """The controller for the plant of `config`."""
+    """The controller for the plant of `config`.
+
+    What several followers estimate apart does not show in the motion; it must die out by the controller's own dynamics.
+    Where it would not within `MEMORY`, disturbances are taken to walk less.
+    """
+    found = _design(config, tuning)
+    if len(config.plant.followers) > 1:
+        for _ in range(MOST_HALVINGS):
+            if np.abs(np.linalg.eigvals(apart(found))).max() < np.exp(-config.timing.control_period / MEMORY):
+                break
+            walks = {name: 0.5 * getattr(tuning, name) for name in ("load_walk", "wind_walk", "lift_walk")}
+            tuning = tuning._replace(**walks)
+            found = _design(config, tuning)
+    return found
+
+
+def apart(own: LqgDesign) -> Float[np.ndarray, "34 34"]:
+    """The step of (state, last inputs) of the controller where no measurement changes, none of its limits reached."""
+    size, feedback = STATES, own.feedback
+    asks = own.commanded @ np.hstack([feedback.position, np.eye(3), np.eye(3)])
+    asks = np.hstack([asks, -own.led_drive, np.zeros((3, 2))])
+    blind = np.eye(size) - own.gain @ own.measured
+    given = np.hstack([asks @ feedback.rows @ blind, asks @ own.ahead])
+    inputs = np.vstack([given, np.eye(size + 3 * LONGEST_DELAY)[size:]])
+    before = sum(weight * inputs[3 * k : 3 * k + 3] for k, weight in enumerate(own.sent))
+    moved = own.transition @ np.hstack([blind, np.zeros((size, 3 * LONGEST_DELAY))]) + own.drive @ before
+    return np.vstack([moved, inputs[: 3 * LONGEST_DELAY]])
+
+
+def _design(config: Config, tuning: Tuning) -> LqgDesign:
     assembly = ideal_model(config, "lqg")
     model = hover_model(config, assembly, tuning.load, tuning.loop_scale)
     transition, found = model.with_leader, feedback(model, tuning.costs, assembly.gravity)
@@ -223,6 +169,8 @@ def design(config: Config, tuning: Tuning) -> LqgDesign:
         sent=np.eye(LONGEST_DELAY + 1)[tuning.late],
         delay=np.array(float(tuning.late)),
         loop_scale=np.array(float(tuning.loop_scale)),
+        commanded=model.commanded,
+        led_drive=model.led_drive,
     )
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from mjxball.arrays import Array, clipped, joined
 from mjxball.baselines.hover_model import LIFT, MEASURED, STATES, TILT, TURN
 from mjxball.baselines.linear import times
-from mjxball.baselines.lqg import Tuning
+from mjxball.baselines.lqg_tuning import Tuning
 from mjxball.baselines.mpc_design import NAME, PAIR, TEAM, Limits, MpcDesign, design, limits_of
 from mjxball.config import Config
 from mjxball.control import rotations

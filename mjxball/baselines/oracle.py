@@ -23,7 +23,8 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import times
-from mjxball.baselines.lqg import Costs, Feedback, feedback
+from mjxball.baselines.lqg import Feedback, feedback
+from mjxball.baselines.lqg_tuning import Costs
 from mjxball.baselines.sharing import Assumed, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
@@ -39,7 +40,7 @@ LOADS = (0.5, 2.0)  # masses of the load over the plant's with own gains, which 
 
 
 class OracleTuning(NamedTuple):
-    """Parameters of the controller: those of `Costs`, and the frequency at which it expects loads to swing."""
+    """Those of `Costs`, and the frequency at which it expects loads to swing: the best of 720 sets on 60 loads."""
 
     position: float = 0.03919
     velocity: float = 0.2003

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mjxball.baselines import make_baseline, make_controller
-from mjxball.baselines.hover_model import ERRORS, LIFT_ERROR, LOAD, MEASURED, RATES, STATES, TILT, TURN, WIND
-from mjxball.baselines.lqg import LONGEST_DELAY, Lqg, Tuning, noises
+from mjxball.baselines.hover_model import ERRORS, LIFT_ERROR, LOAD, MEASURED, RATES, STATES, WIND
+from mjxball.baselines.lqg import MEMORY, Lqg, apart, noises
+from mjxball.baselines.lqg_tuning import LONGEST_DELAY, Tuning
 from mjxball.config import Config, preset, with_plant
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.plant.teams import ring_config
@@ -94,25 +95,24 @@ def test_no_constant_disturbance_leaves_an_error(state: int) -> None:
     np.testing.assert_allclose(plant.memory.expected[state], 0.3, rtol=1e-4)
 
 
-def test_a_follower_of_a_team_forgets() -> None:
-    """Measured apart, followers differ by what the motion does not show: the controller alone must be stable.
+@pytest.mark.parametrize("size", [3, 6])
+def test_what_followers_estimate_apart_dies_out(size: int) -> None:
+    """Where no measurement changes, the controller's own step shrinks any difference of two followers.
 
-    The response of its commands to a constant error of one sensor is that of its own dynamics, without the plant.
+    `apart` is that step: checked against the controller itself, which is linear where no limit is reached.
     """
-    controller = Lqg(RING)
-    own, feedback = controller.design, controller.design.feedback
-    still = np.zeros((3, 18))
-    still[0, 12:14] = 2e-3  # one of three follower measures 2 mm beside the others
+    config = ring_config(with_plant(PAPER, "team6"), size)
+    controller, followers = Lqg(config), size - 1
+    own, random = controller.design, np.random.default_rng(0)
+    assert np.abs(np.linalg.eigvals(apart(own))).max() < np.exp(-config.timing.control_period / MEMORY)
+    still = np.zeros((followers, 18))
+    known = PrivilegedInfo(np.full(followers, config.plant.object_mass), *[np.zeros((followers, 2))] * 3)
     memory = controller.start(still)
-    known = PrivilegedInfo(np.full(3, RING.plant.object_mass), *[np.zeros((3, 2))] * 2, np.zeros(3))
-    sent = []
-    for _ in range(3000):
-        memory, command = controller.step(memory, still, known)
-        sent.append(command[0])
-    assert own.transition.shape == (STATES, STATES)
-    assert feedback.rows.shape[-1] == STATES
-    np.testing.assert_allclose(sent[-1], sent[-500], atol=1e-3)
-    assert np.abs(sent[-1][:2]).max() < 0.1
+    memory = memory._replace(expected=1e-5 * random.standard_normal((followers, STATES)), steps=memory.steps + 10)
+    before = np.concatenate([memory.expected, memory.given], axis=-1)
+    after, _ = controller.step(memory, still, known)
+    found = np.concatenate([after.expected, after.given], axis=-1)
+    np.testing.assert_allclose(found, before @ apart(own).T, atol=1e-9)
 
 
 def test_followers_whose_sensors_disagree_keep_off_the_rotors_limits() -> None:
@@ -126,13 +126,13 @@ def test_followers_whose_sensors_disagree_keep_off_the_rotors_limits() -> None:
 
 
 def test_unknown_masses_and_heavy_loads_settle() -> None:
-    """A pair, calm and with noise and delay, to 10 and 20 mm within 4 s; 0.5 kg at 8 cm leave 15 % of its rotors."""
+    """A pair, calm and with noise and delay, within 4 s to 10 and 20 mm; 0.5 kg at 8 cm and 3.1 rad/s to 15 mm."""
     loads = [{"mass": 0.3, "believed_mass": 0.2, "amplitude": 0.08}, {"mass": 0.5, "amplitude": 0.08, "omega": 3.1}]
     rough = Disturbance(noise=1.0, delay=0.04)
     scenarios = [Scenario(seconds=12.0, **load, disturbance=how) for how in (Disturbance(), rough) for load in loads]
     flown = simulate_batch(PAPER, [(make_baseline("lqg", PAPER), scenarios)], "newton-euler")
     late = np.linalg.norm(flown.error[flown.time > 4], axis=-1).max(axis=0)
-    assert (late < [0.01, 0.01, 0.02, 0.02]).all(), late
+    assert (late < [0.01, 0.015, 0.02, 0.02]).all(), late
 
 
 def test_it_knows_no_more_than_the_believed_mass() -> None:
@@ -143,4 +143,3 @@ def test_it_knows_no_more_than_the_believed_mass() -> None:
     assert np.isfinite(command).all()
     assert state.given.shape == (3 * LONGEST_DELAY,)
     assert not controller.needs_privileged
-    assert {TILT.start, TURN.start} == {6, 8}
