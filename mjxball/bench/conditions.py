@@ -35,7 +35,7 @@ class Air:
     drag: Range = (0.1, 0.5)  # Foerster 2015: 0.24; Faessler et al. 2018: 0.39 and 0.54 [1/s]
     wind: Range = (0.0, 2.0)  # outdoors, a light breeze [m/s]
     fade: Range = (0.0, 0.001)  # [1/s]
-    download: Range = (0.0, 0.2)  # a V-22 in hover: a tenth of its whole thrust
+    download: Range = (0.0, 0.1)  # a V-22 in hover loses a tenth of its whole thrust
     clearance: Range = (0.06, 1.0)  # of the lower of start and goal above the ground, in one flight of two [m]
     loops: Range = (6.0, 40.0)  # roll loops: PX4 and Crazyflies about 6, racing drones to 40 [rad/s]
     quantized: bool = False
@@ -43,7 +43,7 @@ class Air:
 
 OUTDOORS = Air()
 RIGS_AIR = dataclasses.replace(OUTDOORS, loops=(0.0, 0.0))  # random rigs have loops of 4 to 20 rad/s
-CRAZYFLIE = Air((0.25, 0.45), (0.0, 0.3), (0.0, 0.002), (0.0, 0.2), (0.02, 1.0), (0.0, 0.0), True)
+CRAZYFLIE = Air((0.25, 0.45), (0.0, 0.3), (0.0, 0.002), (0.0, 0.1), (0.02, 1.0), (0.0, 0.0), True)
 
 
 def in_calm(scenario: Scenario) -> Scenario:
