@@ -95,7 +95,15 @@ def test_baselines_do_not_round_their_products() -> None:
         followers = () if config.plant.count == 2 else (config.plant.count - 1,)
         seen, one = jnp.full((*followers, 18), 0.01), jnp.ones(followers)
         two = one if not followers else jnp.ones((*followers, 2))
-        known = PrivilegedInfo(0.2 * one, 0.01 * two, 0.0 * two, 2.2 * one, jnp.ones((*followers, config.plant.count)))
+        drones = (*followers, config.plant.count)
+        known = PrivilegedInfo(
+            *(0.2 * one, 0.01 * two, 0.0 * two, 2.2 * one, jnp.ones(drones)),
+            moment_rate=0.0 * two,
+            rotors=jnp.ones((*drones, 3)),
+            force=jnp.ones((*followers, 3)),
+            loop_scale=one,
+            loops=jnp.ones((*drones, 13)),
+        )
         for name in CONTROLLERS:
             try:
                 controller: Any = make_baseline(name, config).controller

@@ -45,7 +45,14 @@ HISTORY = ObservationHistory(previous_action=True, filters=(0.1, 0.5))
 SEEN, MEMORY, ACTION = normal(18), normal(HISTORY.size), random.uniform(-1, 1, (WORLDS, 3))
 MASSES = random.uniform(0.1, 0.3, WORLDS)
 TOTAL, THRUST = random.uniform(2.1, 2.3, WORLDS), np.linspace(0.8, 1.0, 2 * WORLDS).reshape(WORLDS, 2)
-PRIVILEGED = PrivilegedInfo(MASSES, 0.01 * normal(), 0.01 * normal(), TOTAL, THRUST)
+PRIVILEGED = PrivilegedInfo(
+    *(MASSES, 0.01 * normal(), 0.01 * normal(), TOTAL, THRUST),
+    moment_rate=0.01 * normal(),
+    rotors=np.array([10.8, 0.0, 0.0]) + 0.1 * normal(2, 3),
+    force=0.1 * normal(3),
+    loop_scale=random.uniform(0.7, 2.0, WORLDS),
+    loops=0.1 * normal(2, 13),
+)
 FLIGHT = 0.1 * normal(2, 18)  # two observations in a row
 CALM = {"mpc": 0.05 * FLIGHT}  # where no limit is met: programs are solved to a tolerance of their own
 
