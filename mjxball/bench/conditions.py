@@ -22,7 +22,6 @@ POSE_LAG = (0.0, 0.03)  # a position behind the gyro: 13 to 23 ms found [s]
 GAP_RATE = (0.0, 0.25)  # 11 to 22 a minute found [1/s]
 JITTER = (0.0, 0.005)  # of a laptop's period [s]
 THRUST = (0.95, 1.05)  # of a drone, as 2.5 % between flights of one and its propellers leave
-LAG = 0.5  # largest rotor lag times the frequency of the loops: whoever closes fast loops has rotors for them
 # rms of the wind's speed over its mean. Near the ground 0.2 with a length of 8 times the height (Dryden): at 1 m above
 # 1 rad/s as rough as 0.1 with the 1 s of `GUST_TIME`.
 GUST = 0.1
@@ -37,7 +36,7 @@ class Air:
     fade: Range = (0.0, 0.001)  # [1/s]
     download: Range = (0.0, 0.1)  # a V-22 in hover loses a tenth of its whole thrust
     clearance: Range = (0.06, 1.0)  # of the lower of start and goal above the ground, in one flight of two [m]
-    loops: Range = (6.0, 40.0)  # roll loops: PX4 and Crazyflies about 6, racing drones to 40 [rad/s]
+    loops: Range = (6.0, 20.0)  # of roll: gains of PX4 and Crazyflies 6, flights of a Crazyflie 6 to 9 [rad/s]
     quantized: bool = False
 
 
@@ -84,7 +83,6 @@ def in_world(scenario: Scenario, config: Config, random: np.random.Generator, ai
         thrust=scenario.thrust or tuple(map(float, random.uniform(*THRUST, count))),
         thrust_fade=between(air.fade),
         loop_scale=loops / own,
-        rotor_lag_scale=min(1.0, LAG / loops / max(config.plant.of_drones("rotor_lag"))) if air.loops[0] else 1.0,
         rotor_drag=drag,
         wind=(speed * math.cos(way), speed * math.sin(way), 0.0),
         floor=lowest - between(air.clearance) if random.uniform() < 0.5 else None,
