@@ -41,29 +41,29 @@ class Costs(NamedTuple):
 class Tuning(NamedTuple):
     """Parameters of the controller: those of `Costs`, then walks as standard deviations after a second, and others."""
 
-    y: float = 0.0859
-    vy: float = 0.878
-    height: float = 0.16
-    climb: float = 0.419
-    rate: float = 4.33
-    thrust_difference: float = 0.152
-    roll_change: float = 2.71
-    vertical_change: float = 43.1
-    error_limit: float = 0.121
-    load_rate_walk: float = 0.202
-    load_walk: float = 0.00182
-    lift_walk: float = 0.0118
-    wind_walk: float = 0.118
-    rate_walk: float = 0.084
-    velocity_walk: float = 0.0843
-    load_rate_time: float = 2.02  # time constants with which disturbances decay [s]
-    load_time: float = 32
-    lift_time: float = 33
-    wind_time: float = 30.5
-    velocity_noise: float = 0.0325  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
-    angle_noise: float = 0.00877  # [rad]
-    rate_noise: float = 0.0322  # [rad/s]
-    delay: float = 3.6  # of the measurements, rounded [control steps]
+    y: float = 0.166
+    vy: float = 0.845
+    height: float = 0.116
+    climb: float = 0.167
+    rate: float = 2.97
+    thrust_difference: float = 0.195
+    roll_change: float = 1.79
+    vertical_change: float = 51.1
+    error_limit: float = 0.192
+    load_rate_walk: float = 0.0302
+    load_walk: float = 0.00255
+    lift_walk: float = 0.0185
+    wind_walk: float = 0.187
+    rate_walk: float = 0.262
+    velocity_walk: float = 0.0989
+    load_rate_time: float = 2.64  # time constants with which disturbances decay [s]
+    load_time: float = 16.7
+    lift_time: float = 14.6
+    wind_time: float = 51.6
+    velocity_noise: float = 0.0931  # standard deviations of measurements, beside `POSITION_NOISE` [m/s]
+    angle_noise: float = 0.00341  # [rad]
+    rate_noise: float = 0.0852  # [rad/s]
+    delay: float = 12.8  # of the measurements, rounded [control steps]
 
     @property
     def costs(self) -> Costs:
