@@ -25,7 +25,7 @@ from mjxball.sim.scenario import CgPath, Scenario
 
 SECONDS = 30.0  # of a flight
 FLIGHTS = 120  # of a track in each condition
-RADIUS, CRAZYFLIE_RADIUS = 0.010, 0.020  # about the goal, calm [m]
+RADIUS, CRAZYFLIE_RADIUS, MOVING_RADIUS = 0.010, 0.020, 0.020  # about the goal, calm [m]
 WORLD_RADIUS = 2.0  # radius in the condition world over that in calm
 RIG_LENGTH = 0.17  # length of a rig up to which the radius is as above [m]
 MARGIN = 0.15  # trim margin of every load, see `plant.trim`
@@ -118,7 +118,7 @@ def _moving(draw: int) -> list[PlantFlights]:
         scenario = pair.sample(random, condition)
         return scenario and replace(scenario, goal=(0.0, 0.0, 0.0), goal_motion=_goal_motion(random))
 
-    return [PlantFlights(pair.config, sample, moving=True)]
+    return [PlantFlights(pair.config, sample, radius=MOVING_RADIUS, moving=True)]
 
 
 def _goal_motion(random: np.random.Generator) -> GoalMotion:
