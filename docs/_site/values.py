@@ -21,12 +21,11 @@ REPOSITORY = Path(__file__).parents[2]
 sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "benchmarks")]
 
 from mjxball.cli import plant_setup  # noqa: E402
-from mjxball.config import Autopilot, apply_overrides, preset, total_mass  # noqa: E402
+from mjxball.config import Autopilot, preset, total_mass  # noqa: E402
 from mjxball.control import crazyflie, motors  # noqa: E402
 from mjxball.control.axes import axes  # noqa: E402
 from mjxball.control.constants import hover  # noqa: E402
 from mjxball.plant import plant_parameters  # noqa: E402
-from mjxball.plant.trim import largest_amplitude  # noqa: E402
 from mjxball.policy import file  # noqa: E402
 from mjxball.policy.formats.c_header import weight_bytes  # noqa: E402
 from mjxball.sim import disturbances  # noqa: E402
@@ -65,7 +64,6 @@ paper, transport, flight, stand = (preset(name) for name in ("paper", "transport
 two = paper.plant
 stiffness = np.array(plant_parameters(two, paper.attitude).gains.kp)  # of the attitude loop [N m/rad]
 tilt = 0.2 * 9.81 * 0.05 / stiffness[1]  # of a command that holds 0.2 kg 5 cm off [rad]
-wide = apply_overrides(paper, {"plant.cg_axis": "xy", "plant.object_size": (0.34, 0.3, 0.05)})
 full = float(motors.force(motors.MOTORS["2.1"], np.array(crazyflie.FULL), 3.0 - WORN_SAG))
 c_files = "".join(path.read_text() for path in sorted((REPOSITORY / "mjxfly/app").glob("*.[ch]")))
 defined = re.findall(r"#define (\w+) ([\d.e-]+)[fu]?\b", c_files)
@@ -131,8 +129,6 @@ NAMES: dict[str, Any] = {
     "balance": layers("balance"),
     "universal": layers("universal"),
     "noise": disturbances.NOISE[[0, 3, 6, 9]],
-    "reach_of_rotors": largest_amplitude(wide.plant, 0.2, 0.0, (0.0, 1.0)),
-    "reach_of_commands": largest_amplitude(wide, 0.2, 0.0, (0.0, 1.0)),
     "lift": 8 * full / 9.81 / total_mass(rig),  # share of the weight that a battery of 3 V carries
     "ten_minutes": SimpleNamespace(**ten_minutes),
     "silent": [row for row in results("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"],
