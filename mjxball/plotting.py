@@ -24,7 +24,7 @@ SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(
 TABLE = (
     (SOLID, ("stand", "flight", "balance", "universal", "sac", "flight-upgrade")),
     (DASH_DOT_DOT, ("", "robust", "", "transport", "flight-brushless", "paper")),
-    (DASH, ("", "", "", "", "", "lqg")),
+    (DASH, ("", "", "", "lqg-calm", "lqg-world", "lqg")),
     (DASH_DOT, ("mpc", "copy", "pid", "adaptive", "observer", "adaptive-mass")),
     (DOT, ("oracle", "", "", "", "random", "stay")),
 )

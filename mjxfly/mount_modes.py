@@ -118,7 +118,7 @@ def peak_gain(loop: Loop, frequency: Array, damping: float) -> Array:
 
 
 def lowest_mode(loop: Loop, damping: float) -> float:
-    """Frequency [Hz] from which on every mode leaves a gain margin of `REQUIREMENTS.gain`, to 1 %; inf if none does."""
+    """Frequency [Hz] from which on every mode leaves the required gain margin, to 1 %; inf if none does."""
     frequency = np.geomspace(HIGHEST, 1.0, 690)
     short = np.flatnonzero(REQUIREMENTS.gain * peak_gain(loop, frequency, damping) > 1)
     if not short.size:

@@ -39,7 +39,8 @@ def test_every_command_has_many_lines() -> None:
     assert len(cases) >= 250
     assert len({(case.program, case.flaw) for case in cases}) == len(cases)
     count = Counter(case.program for case in cases)
-    assert set(count) == {"train", "eval", "export", "fly", "view", "app", "log", "gains", "design", "identify"}
+    programs = {"train", "eval", "export", "fly", "view", "app", "log", "gains", "design", "identify", "mount"}
+    assert set(count) == programs
     assert min(count[name] for name in ("train", "eval", "view", "fly")) > 40
 
 
@@ -57,6 +58,7 @@ def test_some_of_its_lines_are_refused_well() -> None:
         "gains": "gains.json exists",
         "design": "--plant alone",
         "identify": "log: a directory",
+        "mount": "log: a directory",
     }
     found = [case for case in hostile_lines.every_case() if wanted.get(case.program) == case.flaw]
     assert {case.program for case in found} == set(wanted)
@@ -65,7 +67,7 @@ def test_some_of_its_lines_are_refused_well() -> None:
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("program", ["train", "eval", "view", "fly", "export", "gains", "design", "identify"])
+@pytest.mark.parametrize("program", ["train", "eval", "view", "fly", "export", "gains", "design", "identify", "mount"])
 def test_every_line_is_refused_well(program: str) -> None:
     lines = [case for case in hostile_lines.every_case() if case.program == program]
     wrong = {case.flaw: found for case in lines if (found := hostile_lines.run(case, hostile_lines.SECONDS)["wrong"])}

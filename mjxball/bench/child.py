@@ -5,7 +5,6 @@ It receives the nominal plant's configuration, believed masses and observations,
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from mjxball.config import from_record
 from mjxball.control.followers import Baseline, PrivilegedInfo, residual_on_pid
 from mjxball.errors import FOREIGN, InputError, said
 from mjxball.evaluate.followers import answered
+from mjxball.reading import parse_json
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Host:
     def answer(self, kind: bytes, content: bytes) -> bytes:
         """The frame that answers one of `kind`. Raises InputError if the follower does not do its part."""
         if kind == frames.LOAD:
-            made = self._make(from_record(json.loads(content)))
+            made = self._make(from_record(parse_json(content.decode())))
             refuse_privileged(made)
             self._made.append(Made(made, np.zeros(0)))
             return frames.frame(frames.READY, bytes([residual_on_pid(made)]))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import json
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from mjxball.bench.tracks import TRACKS, PlantFlights, candidate
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import fly_and_measure
+from mjxball.reading import parse_json
 from mjxball.sim.scenario import Scenario
 
 STORED_DRAW = 0
@@ -99,7 +99,7 @@ def read_stored(track: str) -> dict[str, Any]:
     path = resources.files("mjxball.bench") / "draws" / f"{track}.json"
     if not path.is_file():
         raise InputError(f"flights of track {track} are not stored; python -m mjxball.bench.store {track} does it")
-    found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    found: dict[str, Any] = parse_json(path.read_text("utf-8"))
     if (found["benchmark"], found["version"], found["track"]) != (NAME, VERSION, track):
         raise changed(track)
     return found
