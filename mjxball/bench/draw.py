@@ -195,9 +195,9 @@ def oracle_arrivals(
 
 
 def with_perfect_sensors(scenario: Scenario) -> Scenario:
-    """`scenario` as the oracle flies it: no sensor errors, no delay, the true mass; the plant and the air are the same.
+    """`scenario` as the oracle flies it: no sensor errors, delay and jitter, the true mass; plant and air stay.
 
-    What acts on the plant is not part of the sensors, and stays.
+    Errors of the attitude, which are of the sensors, act on no loop either.
     """
     rough = scenario.disturbance
     kept = dataclasses.replace(type(rough)(), gust=rough.gust, gust_seed=rough.gust_seed)

@@ -136,7 +136,13 @@ def _goal_motion(random: np.random.Generator) -> GoalMotion:
 def _team(draw: int) -> list[PlantFlights]:
     base = with_plant(preset("paper"), "team6")
     configs = [ring_config(base, size) for size in TEAMS]
-    return [PlantFlights(config, partial(_sample_team, config), FLIGHTS // len(TEAMS)) for config in configs]
+    each = FLIGHTS // len(TEAMS)
+    return [PlantFlights(config, partial(_sample_team, config), each, _radius(config)) for config in configs]
+
+
+def _radius(config: Config) -> float:
+    """That of a plant by its length, the largest distance of a drone from O [m]."""
+    return RADIUS * max(1.0, max(math.hypot(*drone.mount) for drone in config.plant.drones) / RIG_LENGTH)
 
 
 def _sample_team(config: Config, random: np.random.Generator, condition: str) -> Scenario | None:
@@ -169,9 +175,8 @@ def _rigs(draw: int) -> list[PlantFlights]:
     for size in RIGS:
         rigs = unpadded(sample_rigs(base, size, each, 1000 + draw).rigs, size)
         for row in range(each):
-            radius = RADIUS * max(1.0, float(rigs.length[row]) / RIG_LENGTH)
             config = rig_config(base, rigs, row)
-            found.append(PlantFlights(config, partial(_sample_rig, config, rigs, row), EACH_RIG, radius))
+            found.append(PlantFlights(config, partial(_sample_rig, config, rigs, row), EACH_RIG, _radius(config)))
     return found
 
 
