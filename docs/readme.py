@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from leaderboard import entries
 
+from leaderboard import entries
 from mjxball.bench import CONDITIONS
 from mjxball.bench.entry import HEADS, cells
 from mjxball.running import run_command
@@ -55,23 +54,26 @@ def row(text: str, tracks: Tracks) -> str:
     return " | ".join([text, *(shown(tracks, *column) for column in columns)])
 
 
-def best(found: dict[str, Tracks], names: Iterable[str], track: str) -> str:
-    """Those of `names` that succeed most often in the world, and how often; empty if none has flown the track."""
-    succeeded = {name: found[name][track]["world"]["succeeded"] for name in names if track in found.get(name, {})}
-    most = [name for name, count in succeeded.items() if count == max(succeeded.values())]
-    if not most:
-        return ""
-    share = shown(found[most[0]], track, "success %").partition("/")[2]
-    return f"{', '.join(f'`{name}`' for name in most)} ({share} %)"
+def best(found: dict[str, Tracks], track: str, condition: str) -> str:
+    """Followers that succeed most often, and how often: learned and classical ones, the better kind first."""
+    kinds = []
+    for kind, names in (("learned", TRAINED), ("classical", CLASSICAL)):
+        count = {name: found[name][track][condition]["succeeded"] for name in names if track in found.get(name, {})}
+        if count:
+            most = max(count.values())
+            who = ", ".join(f"`{name}`" for name, succeeded in count.items() if succeeded == most)
+            flights = next(found[name][track][condition]["flights"] for name in count)
+            kinds.append((most, f"{kind} {who} ({100 * most / flights:.0f} %)"))
+    return " before ".join(text for _, text in sorted(kinds, key=lambda one: -one[0])) if len(kinds) == 2 else ""
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
     """What the entries say, true whatever their values are."""
     said = []
     for track, title in TRACKS.items():
-        classical, trained = (best(found, names, track) for names in (CLASSICAL, TRAINED))
-        if classical and trained:
-            said.append(f"Most successful in the world, {title}: learned {trained}, classical {classical}.")
+        order = {condition: best(found, track, condition) for condition in CONDITIONS}
+        if all(order.values()):
+            said.append(f"{title.capitalize()}: calm {order['calm']}; world {order['world']}.")
     with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
         parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
     said.append(f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1))
