@@ -76,8 +76,9 @@ def test_the_wheel_holds_every_module_and_policy_and_nothing_else(wheel: Path) -
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     modules = {str(path.relative_to(REPOSITORY)) for house in PARTS[:2] for path in (REPOSITORY / house).rglob("*.py")}
     policies = {f"mjxball/{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "policies").rglob("*.npz")}
+    draws = {f"mjxball/bench/draws/{path.name}" for path in (REPOSITORY / "mjxball" / "bench" / "draws").iterdir()}
     assert len(policies) >= 3
-    assert held == modules | policies | parts() | {"mjxball/py.typed", "mjxfly/twin/names.csv"}
+    assert held == modules | policies | draws | parts() | {"mjxball/py.typed", "mjxfly/twin/names.csv"}
 
 
 @pytest.mark.slow

@@ -19,8 +19,9 @@ from command_line import REPOSITORY, TINY, environment
 from packaging.requirements import Requirement
 
 sys.path.append(str(REPOSITORY / "docs"))
-import leaderboard
 from readme import BLOCK, block
+
+import leaderboard
 
 README = (REPOSITORY / "README.md").read_text()
 ROWS = re.findall(r"^(?!task)(\S.*?) \| `(.+?)` \| `?(\w+)`?.*$", README, flags=re.MULTILINE)

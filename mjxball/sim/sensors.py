@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Vector
 
     Measured = Float[Array, "... slots"]  # 12, or 18 with a sensor of the object: the slots of an observation
+    Errors = Float[Array, "... 18"]
 
 OWN = 12  # numbers of a follower's own state: position, roll, pitch, yaw, velocity, body rates
 # Errors at level 1 are a Crazyflie's, as `benchmarks/sensor_levels.py` finds them in public flights with motion capture
@@ -41,7 +42,7 @@ LAGGING = np.array([*[1.0] * 3, *[0.0] * 3, *[1.0] * 3, *[0.0] * 3, *[0.0] * 6])
 class Sample(NamedTuple):
     """Disturbances of one control step, or of all steps of a flight along a leading axis. The default is none."""
 
-    errors: tuple[Measured, ...] = ()  # added to the measurement in this order
+    errors: tuple[Errors, ...] = ()  # added to the measurement in this order
     received: Bool[Array, "..."] | None = None  # whether a measurement arrives; None: always
     force: Vector | None = None  # external force on O in the world until the next step [N]; None: none
     late: Float[Array, "..."] | None = None  # physics steps by which the commands at this step come late; None: none

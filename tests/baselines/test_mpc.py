@@ -172,7 +172,7 @@ def test_a_team_takes_off_a_torque_and_a_mass_that_nobody_told(drones: int) -> N
     flown = simulate_batch(config, [(make_baseline(name, config), [scenario]) for name in names], "newton-euler")
     left = dict(zip(names, np.abs(flown.error[-1]).max(axis=-1), strict=True))
     assert left["copy"] > 0.1
-    assert left["mpc"] < 0.02 * left["copy"], left
+    assert left["mpc"] < 0.05 * left["copy"], left
 
 
 @pytest.fixture(scope="module")

@@ -204,8 +204,8 @@ def test_the_command_writes_an_entry_and_the_reason_of_every_flight(short: Path)
         assert found["succeeded"] == sum(not one["reasons"] for one in mine)
         for reason, count in found["reasons"].items():
             assert count == sum(reason in one["reasons"].split() for one in mine)
-    # Level commands do not bring the object to its goal.
-    assert all("late" in one["reasons"] for one in flown)
+    # Level commands do not bring the object to its goal; wind may carry it away.
+    assert all({"late", "crashed"} & set(one["reasons"].split()) for one in flown)
 
 
 @pytest.mark.slow

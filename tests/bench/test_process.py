@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY
 
-from mjxball.baselines import make_baseline
+from mjxball.baselines import make_controller
 from mjxball.bench import evaluation, process
 from mjxball.bench.draw import ENGINE
 from mjxball.bench.evaluation import Result, evaluate, fresh_key, seed_of, with_seed
@@ -17,6 +17,8 @@ from mjxball.bench.followers import identity
 from mjxball.bench.process import FollowerProcess
 from mjxball.bench.tracks import FLIGHTS
 from mjxball.config import preset
+from mjxball.control.followers import Baseline
+from mjxball.control.leader import clip_command
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import fly_and_measure
 from mjxball.export import main as export
@@ -255,8 +257,7 @@ def test_noise_and_order_come_from_the_key_alone(own: Path) -> None:
     np.testing.assert_array_equal(values(again), values(same))
     for condition in ("calm", "world"):
         mine, others = (values([one for one in found if one.flight.condition == condition]) for found in (same, other))
-        # Calm, the order of flights changes the last bits of what is computed for all at once.
-        assert (np.abs(mine - others).max() > 1e-6) == (condition == "world")
+        assert np.abs(mine - others).max() > 1e-6  # calm flights have constant errors of the key
     flights = [one.flight for one in same]
     seeds = {with_seed(one, key, 0).disturbance.seed for one in flights for key in (KEY, fresh_key())}
     assert len(seeds) == 2 * len(flights)
@@ -299,7 +300,13 @@ def test_a_team_in_a_process_flies_as_in_a_simulation(own: Path) -> None:
     config = group.config
     scenarios = [with_seed(one.flight, f"{KEY}:team", 0) for one in found]
     assert len({one.mass for one in scenarios}) == len(scenarios)
-    lqg = make_baseline("lqg", config)
+    limits = config.command.tilt_limit, config.command.vertical_limit
+
+    class Clipped(Baseline):
+        def __call__(self, observation: np.ndarray) -> np.ndarray:
+            return clip_command(super().__call__(observation), *limits)
+
+    lqg = Clipped(make_controller("lqg", config), config)
     radii, deadlines = (np.array([getattr(one.flight, name) for one in found]) for name in ("radius", "deadline"))
     _, direct = fly_and_measure(config, [(lqg, scenarios)], ENGINE, radii, deadlines)
     again = [one._replace(metrics=metrics) for one, metrics in zip(found, direct, strict=True)]
@@ -307,14 +314,17 @@ def test_a_team_in_a_process_flies_as_in_a_simulation(own: Path) -> None:
 
 
 def test_a_policy_has_one_score_in_every_form(own: Path) -> None:
-    """A residual on the PID: as a file and by a class to the bit; a controller's float64 and ONNX round otherwise."""
+    """A residual on the PID: as a file and by a class to the bit; a controller's float64 and ONNX round otherwise.
+
+    Where a measurement is between two multiples of its resolution, rounding decides: 2 % of a time at limits.
+    """
     pytest.importorskip("onnxruntime")
     assert export([str(FLIGHT), "flight.onnx"]) == 0
     texts = (str(FLIGHT), "own:flies", "own:controller", "flight.onnx", "own:Complete")
     file, by_class, controller, onnx, complete = (flown(text, "crazyflie") for text in texts)
     np.testing.assert_array_equal(values(by_class), values(file))
     for other in (controller, onnx):
-        np.testing.assert_allclose(values(other), values(file), rtol=3e-3, atol=1e-6)
+        np.testing.assert_allclose(values(other), values(file), rtol=0.02, atol=1e-6)
         assert [one.failures for one in other] == [one.failures for one in file]
     # A class that does not say that its command is a residual answers complete commands.
     assert np.abs(values(complete)[:, 0] / values(file)[:, 0] - 1).max() > 0.05
