@@ -45,6 +45,7 @@ MODULES = (  # known by their last name
         "mjxball.evaluate.metrics",
         "mjxball.evaluate.running_metrics",
         "mjxball.physics.engine",
+        "mjxball.sim.sensors",
     ),
     *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),
     *("mjxball.train.program", "mjxfly.app.protocol", "mjxfly.view.live"),

@@ -16,6 +16,7 @@ from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.goals import GoalMotion, GoalPath
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.sensors import NOISE
 
 PAPER = preset("paper")
 STILL = Scenario(amplitude=0.0, goal=(0.0, 0.0, 0.0), seconds=30.0)
@@ -90,6 +91,19 @@ def test_the_objects_error_is_that_of_the_own_measured_state(plant: str) -> None
         place = body[:, :3] - rotations.rotate(matrix, mount - lead)
         free = [0.0, 0.0, 1.0] if config.plant.stand != "free" else np.ones(3)
         np.testing.assert_allclose(body[:, 12:15], free * (flight.target + lead - place), atol=1e-12)
+
+
+def test_a_sensor_of_the_object_has_errors_of_its_own() -> None:
+    """Then the object's error is not that of the own state, and its noise has its own deviation."""
+    rough = Disturbance(noise=1.0, object_sensor=True, seed=1)
+    flight = simulate(PAPER, copying(PAPER), dataclasses.replace(STILL, disturbance=rough, seconds=60.0))
+    seen = flight.observation
+    off = seen[:, 12:15] - flight.error
+    np.testing.assert_allclose(off.std(axis=0), NOISE[12:15], rtol=0.08)  # five deviations of 3000
+    matrix = rotations.matrix_from_quaternion(rotations.quaternion_from_euler(seen[:, 3:6]))
+    own = -seen[:, :3] + rotations.rotate(matrix, np.array(PAPER.plant.drones[1].mount)) - flight.error
+    # Along x, where attitude does not enter to first order; independent: within five deviations of 3000.
+    assert abs(np.corrcoef(off[:, 0], own[:, 0])[0, 1]) < 0.1
 
 
 def test_goals_of_training_move_and_jump(transport: Config) -> None:
