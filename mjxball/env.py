@@ -427,8 +427,18 @@ class TransportEnv:
             tilt_disagreement=(commands.follower - commands.leader)[..., self._unloaded],
             spread=self._spread(commands.follower, after.parameters) if self._followers else None,
             ball=jnp.atleast_1d(plant.ball_offset / self._ball_limit),
+            rotors=self._rotors(after) if rewards.used(self.config.reward.rotor_limits) else None,
             terminated=terminated,
         )
+
+    def _rotors(self, world: PipelineState) -> Float[Array, " rotors"]:
+        """Forces of all rotors over their largest; half for padding."""
+        load, plant = world.load, self.config.plant
+        own = plant_parameters(plant, self.config.attitude) if world.parameters == () else world.parameters
+        most: Array = jnp.asarray(own.rotor_force_max, jnp.float32)
+        most = most if load.thrust_scale is None else most * load.thrust_scale
+        share = world.plant.rotor_force / jnp.maximum(most, 1e-9)[..., None]
+        return jnp.where(most[..., None] > 0, share, 0.5).reshape(-1)
 
     def _spread(self, commands: Float[Array, "followers 3"], rig: Any) -> Float[Array, "followers 3"]:
         """Deviation of each command from the mean over the followers that fly; 0 for padding."""

@@ -33,7 +33,11 @@ class RewardInputs(NamedTuple):
     tilt_disagreement: Scalar  # follower's minus leader's command about the axis without CG torque [rad]
     spread: Vector | None  # follower's command minus the mean over followers [rad, m/s2], None with one follower
     ball: Float[Array, "... directions"]  # offset of a rolling ball along the load's directions, over the end stop's
+    rotors: Float[Array, "... rotors"] | None  # forces of all rotors over their largest, None if no weight needs them
     terminated: Bool[Array, "..."]  # whether the episode ended by leaving the termination distance or by diverging
+
+
+NEAR_LIMIT = 0.1  # share of a rotor's largest force within which it counts as near a limit
 
 
 def paper_reward(leader_command: Vector, follower_command: Vector) -> Scalar:
@@ -65,21 +69,24 @@ def task_reward(weights: Reward, step: RewardInputs) -> Scalar:
     def of_command(difference: Vector) -> Scalar:
         return square(difference[..., :2]) + 0.01 * difference[..., 2] ** 2
 
-    if _used(weights.command_change):
+    if used(weights.command_change):
         total = total - weights.command_change * of_command(step.command_change)
-    if _used(weights.spread) and step.spread is not None:
+    if used(weights.spread) and step.spread is not None:
         total = total - weights.spread * of_command(step.spread)
-    if _used(weights.tilt_disagreement):
+    if used(weights.tilt_disagreement):
         total = total - weights.tilt_disagreement * step.tilt_disagreement**2
-    if _used(weights.ball):
+    if used(weights.ball):
         total = total - weights.ball * square(step.ball)
-    if _used(weights.steady_action) and step.action_average is not None:
+    if step.rotors is not None:
+        near = xp.maximum(xp.abs(step.rotors - 0.5) - (0.5 - NEAR_LIMIT), xp.zeros_like(step.rotors))
+        total = total - weights.rotor_limits * square(near)
+    if used(weights.steady_action) and step.action_average is not None:
         total = total - weights.steady_action * square(step.action_average)
     return total
 
 
-def _used(weight: Scalar | float) -> bool:
-    """False for a weight of 0. In a sweep the weight is traced and its value unknown."""
+def used(weight: Scalar | float) -> bool:
+    """Whether a `weight` is not 0. In a sweep the weight is traced and its value unknown."""
     return not isinstance(weight, (int, float)) or weight != 0
 
 

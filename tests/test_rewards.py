@@ -12,7 +12,9 @@ ZERO = np.zeros(3)
 ERROR_ONLY = Reward(error=2.0, error_scale=0.1, velocity=0, tilt=0, rates=0, effort=0, smoothness=0)
 
 
-STILL = RewardInputs(*[ZERO] * 10, tilt_disagreement=0.0, spread=ZERO, ball=ZERO[:1], terminated=np.array(False))
+STILL = RewardInputs(
+    *[ZERO] * 10, tilt_disagreement=0.0, spread=ZERO, ball=ZERO[:1], rotors=None, terminated=np.array(False)
+)
 
 
 def task(weights=ERROR_ONLY, **parts):
@@ -36,6 +38,12 @@ def test_task_reward_is_zero_at_the_goal_and_nowhere_positive():
     names = ("error", "velocity", "euler", "rates", "action", "last_action")
     rewards = [task(everything, **dict(zip(names, random.normal(size=(6, 3)), strict=True))) for _ in range(20)]
     assert max(rewards) < 0
+
+
+def test_rotors_cost_only_within_a_tenth_of_their_largest_force_of_a_limit():
+    weights = Reward(error=0, rotor_limits=3.0)
+    assert task(weights, rotors=[0.1, 0.5, 0.9]) == 0
+    assert task(weights, rotors=[0.04, 0.5, 1.0]) == pytest.approx(-3.0 * (0.06**2 + 0.1**2), rel=1e-12)
 
 
 def test_error_cost_is_quadratic_near_the_goal():

@@ -187,6 +187,13 @@ class Reward:
         low=0,
         high=1e9,
     )
+    rotor_limits: float = setting(
+        0.0,
+        "weight of the sum over all rotors of the squared share by which a force is nearer than a tenth of the largest "
+        "to a limit",
+        low=0,
+        high=1e9,
+    )
     termination: float = setting(50.0, "cost of a termination", low=0, high=1e9)
 
 
