@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from mjxball.arrays import Array, clipped, joined
 from mjxball.baselines.hover_model import LIFT, MEASURED, STATES, TILT, TURN
@@ -87,7 +88,7 @@ def least(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         slope = v + BEYOND * (beyond[active] @ chosen)
         if np.abs(slope).max() < TOLERANCE:
             break
-        step = np.linalg.solve(unit + BEYOND * chosen.T @ chosen, -slope)
+        step = dposv(unit + BEYOND * (chosen.T @ chosen), -slope)[1]  # a third of the time of `np.linalg.solve`
         before, change, share = cost, rows @ step, 1.0
         while True:
             there, value = v + share * step, at + share * change
