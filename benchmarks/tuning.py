@@ -1,15 +1,16 @@
 """The tuning of the references of mjxball-bench: a search on flights that no table reports.
 
 `python benchmarks/tuning.py CONTROLLER [--track TRACK ...] [--condition both|calm|world] [--sets N] [--rounds N]
-[--flights N] [--width W] [--log FILE]`
+[--flights N] [--plants N] [--width W] [--cores N] [--log FILE]`
 
-CMA-ES (Hansen) over the logarithms of a controller's tuning; it starts from that which the controller has. All sets of
-a round fly all flights as one compiled program, on the CPU or on a GPU; `mpc` solves its programs on the CPU, set by
-set. What is made small is the mean over flights of the time after which |e_o| stays within a bound, over that of
-`oracle` and at most four, plus the share of flights without success: later than 1.25 times `oracle`, or a rotor at its
-limit for more than 5 % of the time. Bounds are those of the benchmark, whose draw 4711 flies here and in no table. Of
-an oracle it is the mean of that time in seconds, for these bounds and for three tenths of them. Every set is written to
-the log, one line of JSON each: its tuning, its cost, and the cost's parts.
+CMA-ES (Hansen) over the logarithms of a controller's tuning; it starts from that which the controller has for both
+conditions. All sets of a round fly all flights of a plant as one compiled program, on the CPU or on a GPU; `mpc` solves
+its programs on the CPU, the sets shared out among processes. What is made small is the mean over flights of the time
+after which |e_o| stays within a bound, over that of `oracle` and at most four, plus the share of flights without
+success: later than the benchmark's deadline, or a rotor at its limit for more than 5 % of the time. Bounds and
+deadlines are those of the benchmark, whose draw 4711 flies here and in no table. Of an oracle it is the mean of that
+time in seconds, for these bounds and for three tenths of them. Every set is written to the log, one line of JSON each:
+its tuning, its cost, and the cost's parts.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import functools
 import json
 import math
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -36,8 +38,8 @@ from mjxball.baselines import crazyflie_lqg, crazyflie_oracle, lqg, make_control
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.pid import Pid
 from mjxball.bench import CONDITIONS
-from mjxball.bench.draw import groups_of, with_perfect_sensors
-from mjxball.bench.tracks import TRACKS
+from mjxball.bench.draw import sample_group, with_perfect_sensors
+from mjxball.bench.tracks import TRACKS, PlantFlights
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Controller
 from mjxball.evaluate.metrics import rotor_limits
@@ -52,10 +54,12 @@ from mjxball.xla import enable_compilation_cache
 
 DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
 STRICT = 0.3  # share of the bounds within which an oracle is asked to stay, too
-LATER, LIMITED = 1.25, 0.05  # of a success: time over that of `oracle`, share of time with a rotor at its limit
+LIMITED = 0.05  # largest share of time with a rotor at its limit, of a success
 ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
 WORST = 4.0  # times that of `oracle` a flight counts at most
 SETS, ROUNDS, WIDTH, FLIGHTS = 24, 40, 0.25, 24
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+IN_WORKERS = {"JAX_PLATFORMS": "cpu"} | dict.fromkeys(THREADS, "1")  # environment of the processes of `--cores`
 
 
 class Part(NamedTuple):
@@ -65,16 +69,13 @@ class Part(NamedTuple):
     scenarios: Sequence[Scenario]
     bounds: np.ndarray  # (n,) [m]
     conditions: np.ndarray  # (n,) the name of each flight's
+    known: np.ndarray  # (n,) after which |e_o| stays within the bound with `oracle` [s]
+    deadlines: np.ndarray  # (n,) [s]
 
-    @property
-    def strict(self) -> Part:
-        """Those with smaller bounds, for the search of an oracle."""
-        return self.undisturbed._replace(bounds=STRICT * self.bounds)
-
-    @property
-    def undisturbed(self) -> Part:
-        """The same flights as `oracle` flies them."""
-        return self._replace(scenarios=[with_perfect_sensors(one) for one in self.scenarios])
+    def of_oracle(self, share: float) -> Part:
+        """The same flights as an oracle flies them, with this share of the bounds."""
+        perfect = [with_perfect_sensors(one) for one in self.scenarios]
+        return self._replace(scenarios=perfect, bounds=share * self.bounds)
 
 
 class Measured(NamedTuple):
@@ -85,32 +86,36 @@ class Measured(NamedTuple):
     peak: np.ndarray  # largest |e_o| in the last third [m]
 
 
-def flights_of(tracks: Sequence[str], condition: str, count: int, plants: int | None = None) -> list[Part]:
+def flights_of(tracks: Sequence[str], condition: str, count: int, plants: int | None, pool: Executor) -> list[Part]:
     """The flights of a search: `count` in each condition on each plant of `tracks`, those that `oracle` succeeds in.
 
     `plants`: this many of each track, evenly spaced; None: all.
     """
-    parts = []
+    chosen = []
     for track in tracks:
-        groups = groups_of(track, DRAW)
-        for group in groups if plants is None else groups[:: max(len(groups) // plants, 1)]:
-            chosen = [
-                one
-                for name in CONDITIONS
-                if condition in (name, "both")
-                for one in [flight for flight in group.flights if flight.condition == name][:count]
-            ]
-            scenarios = [
-                dataclasses.replace(
-                    one.scenario,
-                    seconds=SECONDS,
-                    disturbance=dataclasses.replace(one.scenario.disturbance, seed=number),
-                )
-                for number, one in enumerate(chosen)
-            ]
-            bounds, names = np.array([one.radius for one in chosen]), np.array([one.condition for one in chosen])
-            parts.append(Part(group.config, scenarios, bounds, names))
-    return parts
+        numbers = range(len(_plants(track)))
+        chosen += [(track, number) for number in numbers[:: max(len(numbers) // plants, 1) if plants else 1]]
+    return list(pool.map(functools.partial(_part, condition, count), *zip(*chosen, strict=True)))
+
+
+@functools.cache
+def _plants(track: str) -> list[PlantFlights]:
+    return TRACKS[track].flights(DRAW)
+
+
+def _part(condition: str, count: int, track: str, number: int) -> Part:
+    """The flights of a search on plant `number` of a track."""
+    group = sample_group(track, DRAW, number, dataclasses.replace(_plants(track)[number], count=count))
+    chosen = [one for one in group.flights if condition in (one.condition, "both")]
+    scenarios = [
+        dataclasses.replace(
+            one.scenario, seconds=SECONDS, disturbance=dataclasses.replace(one.scenario.disturbance, seed=seed)
+        )
+        for seed, one in enumerate(chosen)
+    ]
+    columns = zip(*((one.radius, one.condition, one.oracle_arrival, one.deadline) for one in chosen), strict=True)
+    radii, conditions, arrivals, deadlines = map(np.array, columns)
+    return Part(group.config, scenarios, radii, conditions, arrivals + group.config.timing.control_period, deadlines)
 
 
 class Tuned(NamedTuple):
@@ -145,6 +150,7 @@ TUNED: dict[str, Tuned] = {
         oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning, (1.0,))[0], _with("gains", "oracle")
     ),
     "mpc": Tuned(mpc.Mpc.tuning, None, mpc.Mpc),
+    "mpc-team": Tuned(mpc.Mpc.team_tuning, None, mpc.Mpc),
     "pid": Tuned(Pid.gains, lambda config, gains: gains, _with("gains", "pid")),
     "observer": Tuned(Observer.gains, lambda config, gains: gains, _with("gains", "observer")),
 }
@@ -195,11 +201,13 @@ class Flown:
         return Measured(np.maximum(seconds, self._period), limited, peak)
 
 
-def fly_all(name: str, part: Part, tunings: Sequence[Any], flown: Flown | None, pool: Executor) -> Measured:
+def fly_all(name: str, part: Part, tunings: Sequence[Any], flown: Flown | None, pool: Executor, cores: int) -> Measured:
     """What all `tunings` do in the flights of `part`; `flown` is None where there is no compiled program."""
     if flown is None:
-        each = pool.map(functools.partial(_simulate, name, part), tunings)
-        return Measured(*(np.stack(column) for column in zip(*each, strict=True)))
+        several = math.ceil(len(tunings) / cores)  # in one process, which steps their plants together
+        chunks = [tunings[first : first + several] for first in range(0, len(tunings), several)]
+        each = pool.map(functools.partial(_simulate, name, part), chunks)
+        return Measured(*(np.concatenate(column) for column in zip(*each, strict=True)))
     found = list(pool.map(functools.partial(_design, name, part.config), tunings))
     return flown(jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *found))
 
@@ -210,40 +218,39 @@ def _design(name: str, config: Config, tuning: Any) -> Any:
     return arrays(config, tuning)
 
 
-def _simulate(name: str, part: Part, tuning: Any) -> Measured:
-    """(n,) each: the flights of one tuning, in NumPy."""
-    config = part.config
-    follower = Baseline(TUNED[name].make(config, tuning), config)
-    flight = simulate_batch(config, [(follower, part.scenarios)], "newton-euler")
+def _simulate(name: str, part: Part, tunings: Sequence[Any]) -> Measured:
+    """What `tunings` do in the flights of `part`, in NumPy."""
+    config, make = part.config, TUNED[name].make
+    flights = [(Baseline(make(config, tuning), config), part.scenarios) for tuning in tunings]
+    flight = simulate_batch(config, flights, "newton-euler")
     far = np.where(flight.diverged, np.inf, np.linalg.norm(flight.error, axis=-1))
-    most = rotor_limits(config.plant, part.scenarios)[..., None]
+    most = np.tile(rotor_limits(config.plant, part.scenarios), (len(tunings), 1))[..., None]
     near = near_limit(AT_LIMIT_WITHIN, flight.rotor_force, most).max(axis=(-2, -1))
-    outside, rows = ~(far <= part.bounds), np.arange(1, len(far) + 1)[:, None]
+    outside, rows = ~(far <= np.tile(part.bounds, len(tunings))), np.arange(1, len(far) + 1)[:, None]
     last = (outside * rows).max(axis=0)
     seconds = np.where(last == len(far), np.inf, np.maximum(last, 1) * config.timing.control_period)
-    return Measured(seconds, near.mean(axis=0), far[2 * len(far) // 3 :].max(axis=0))
+    found = seconds, near.mean(axis=0), far[2 * len(far) // 3 :].max(axis=0)
+    return Measured(*(values.reshape(len(tunings), -1) for values in found))
 
 
 class Search:
     """The cost of sets of one controller on all parts, and its log."""
 
-    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: Executor):
-        self.tuned, self._name, self._log, self._pool = TUNED[name], name, log, pool
-        self._threads = ThreadPoolExecutor(2 * len(parts))  # which compile and fly all plants at once
-        both = [kind for part in parts for kind in (part.undisturbed, part.strict)]
-        self._parts = both if name in ORACLES else list(parts)
-        compiled = self.tuned.arrays is not None
-        self._flown = [Flown(name, part) if compiled else None for part in self._parts]
-        self._known = [None] * len(both) if name in ORACLES else list(self._threads.map(known, parts))
+    def __init__(self, name: str, parts: Sequence[Part], log: Path | None, pool: Executor, cores: int):
+        self.tuned, self._name, self._log, self._pool, self._cores = TUNED[name], name, log, pool, cores
+        self._absolute = name in ORACLES
+        self._parts = [part.of_oracle(share) for part in parts for share in (1.0, STRICT)] if self._absolute else parts
+        self._threads = ThreadPoolExecutor(len(self._parts))  # which compile and fly all plants at once
+        self._flown = [Flown(name, part) if self.tuned.arrays else None for part in self._parts]
         self._begun = time.perf_counter()
 
     def __call__(self, sets: np.ndarray) -> np.ndarray:
         """(S,) costs of `sets` (S, k), values of what is `searched`."""
         tunings = [tuned(self.tuned.start, values) for values in sets]
         flown = self._threads.map(
-            lambda part, fly: fly_all(self._name, part, tunings, fly, self._pool), self._parts, self._flown
+            lambda part, fly: fly_all(self._name, part, tunings, fly, self._pool, self._cores), self._parts, self._flown
         )
-        numbers = [numbers_of(*both) for both in zip(flown, self._known, strict=True)]
+        numbers = [numbers_of(one, part, self._absolute) for one, part in zip(flown, self._parts, strict=True)]
         of_flights = {name: np.concatenate([one[name] for one in numbers], axis=1) for name in numbers[0]}
         conditions = np.concatenate([part.conditions for part in self._parts])
         parts = {
@@ -263,21 +270,17 @@ class Search:
                 file.write(json.dumps({"controller": self._name, "seconds": seconds, **record}) + "\n")
 
 
-def known(part: Part) -> Measured:
-    """The flights of `oracle`."""
-    name = ORACLES[part.config.autopilot.kind == "crazyflie"]
-    with ThreadPoolExecutor(1) as alone:
-        return fly_all(name, part.undisturbed, [TUNED[name].start], Flown(name, part.undisturbed), alone)
+def numbers_of(measured: Measured, part: Part, absolute: bool) -> dict[str, np.ndarray]:
+    """(S, n) each: cost, time [s], success (0, 1), share of time at limits and peak [m] of every flight.
 
-
-def numbers_of(measured: Measured, known: Measured | None) -> dict[str, np.ndarray]:
-    """(S, n) each: cost, time [s], success (0, 1), share of time at limits and peak [m] of every flight."""
+    Costs are of the time in seconds if `absolute`, else of that over the oracle's.
+    """
     late, limited = np.minimum(measured.time, SECONDS), measured.limited > LIMITED
-    if known is None:
+    if absolute:
         succeeds, ratio = np.isfinite(measured.time) & ~limited, late
     else:
-        succeeds = (measured.time <= LATER * known.time) & ~limited
-        ratio = np.minimum(late / np.minimum(known.time, SECONDS), WORST)
+        succeeds = (measured.time <= part.deadlines) & ~limited
+        ratio = np.minimum(late / np.minimum(part.known, SECONDS), WORST)
     return {
         "cost": ratio + 1.0 - succeeds,
         "time": late,
@@ -315,17 +318,21 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--sets", type=int, default=SETS, help="in each round")
     parser.add_argument("--width", type=float, default=WIDTH, help="of the first steps, in the logarithm")
-    parser.add_argument("--cores", type=int, default=1, help="processes that compute designs, and that fly `mpc`")
+    parser.add_argument(
+        "--cores", type=int, default=1, help="processes: they sample flights, compute designs, fly `mpc`"
+    )
     parser.add_argument("--log", type=Path, metavar="FILE", help="JSON lines, added to")
     options = parser.parse_args()
     enable_compilation_cache()
+    jax.devices()  # this process keeps its own, whatever the environment says from here on
+    os.environ |= IN_WORKERS
     with (
         ProcessPoolExecutor(options.cores, multiprocessing.get_context("spawn"))
         if options.cores > 1
         else ThreadPoolExecutor(1) as pool
     ):
-        parts = flights_of(options.track, options.condition, options.flights, options.plants)
-        search = Search(options.controller, parts, options.log, pool)
+        parts = flights_of(options.track, options.condition, options.flights, options.plants, pool)
+        search = Search(options.controller, parts, options.log, pool, options.cores)
         start = np.log([getattr(search.tuned.start, name) for name in searched(search.tuned.start)])
         best, least = minimise(lambda sets: search(np.exp(sets)), start, options.width, options.sets, options.rounds)
     found = tuned(search.tuned.start, np.exp(best))

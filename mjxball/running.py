@@ -15,7 +15,7 @@ from mjxball.xla import explained
 
 FAULT = 3  # exit code after a defect of the program; 1 says that a check failed
 # The extra that installs a package, if it is not `train`.
-EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "osqp": "mpc"}
+EXTRAS = {"onnx": "onnx", "gymnasium": "gym"}
 EXTRAS |= dict.fromkeys(("cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
 
 

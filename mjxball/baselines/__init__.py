@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mjxball.baselines.adaptive import Adaptive
-from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
+from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, CrazyflieLqg, WorldCrazyflieLqg
 from mjxball.baselines.crazyflie_oracle import CrazyflieOracle
 from mjxball.baselines.lqg import CalmLqg, Lqg, WorldLqg
 from mjxball.baselines.mpc import Mpc
@@ -25,6 +25,7 @@ __all__ = [
     "BASELINES",
     "CONTROLLERS",
     "Adaptive",
+    "CalmCrazyflieLqg",
     "CalmLqg",
     "Copy",
     "CrazyflieLqg",
@@ -36,6 +37,7 @@ __all__ = [
     "Pid",
     "Random",
     "Stay",
+    "WorldCrazyflieLqg",
     "WorldLqg",
     "make_baseline",
     "make_controller",
@@ -51,8 +53,8 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "pid": Pid,
     "observer": Observer,
     "lqg": lambda config: _of_kind(config, Lqg, CrazyflieLqg),
-    "lqg-calm": lambda config: _of_kind(config, CalmLqg, CrazyflieLqg),
-    "lqg-world": lambda config: _of_kind(config, WorldLqg, CrazyflieLqg),
+    "lqg-calm": lambda config: _of_kind(config, CalmLqg, CalmCrazyflieLqg),
+    "lqg-world": lambda config: _of_kind(config, WorldLqg, WorldCrazyflieLqg),
     "mpc": Mpc,
 }
 VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-calm", "lqg-world", "mpc")

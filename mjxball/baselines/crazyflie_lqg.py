@@ -81,6 +81,10 @@ class Tuning(NamedTuple):
         return Decay(self.load_rate_time, self.load_time, self.lift_time, self.wind_time)
 
 
+BOTH = Tuning()  # for both conditions of the benchmark
+CALM, WORLD = BOTH, BOTH
+
+
 def changes(model: LinearModel, costs: Costs, period: float) -> Float[np.ndarray, "2 n+2"]:
     """K of the command's change -K (x, u) every control `period` [s]: the LQR of outputs and changes."""
     n, names = len(model.names), model.names
@@ -161,7 +165,7 @@ class CrazyflieLqg:
 
     name = "lqg"
     needs_privileged = False
-    tuning = Tuning()
+    tuning = BOTH
 
     def __init__(self, config: Config, tuning: Tuning | None = None):
         self.design = design(config, tuning or self.tuning)
@@ -195,6 +199,20 @@ class CrazyflieLqg:
         integral, copied = self._pid.step(state.integral, observation)
         after = LqgState(expected, commands[..., :-2], integral, state.steps + 1.0)
         return after, self._actuators.sent(command, copied)
+
+
+class CalmCrazyflieLqg(CrazyflieLqg):
+    """`lqg` for flights that are known to be without noise and delay."""
+
+    name = "lqg-calm"
+    tuning = CALM
+
+
+class WorldCrazyflieLqg(CrazyflieLqg):
+    """`lqg` for flights that are known to be with noise and delay."""
+
+    name = "lqg-world"
+    tuning = WORLD
 
 
 class Actuators:

@@ -31,7 +31,7 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import regulator, riccati, times
-from mjxball.baselines.lqg_tuning import CALM, LONGEST_DELAY, TEAM, WORLD, Costs, Tuning
+from mjxball.baselines.lqg_tuning import CALM, LONGEST_DELAY, TEAM, TEAM_CALM, TEAM_WORLD, WORLD, Costs, Tuning
 from mjxball.baselines.sharing import Assumed, Wanted, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
@@ -246,11 +246,11 @@ class CalmLqg(Lqg):
     """`lqg` for flights that are known to be without noise and delay."""
 
     name = "lqg-calm"
-    tuning = CALM
+    tuning, team_tuning = CALM, TEAM_CALM
 
 
 class WorldLqg(Lqg):
     """`lqg` for flights that are known to be with noise and delay."""
 
     name = "lqg-world"
-    tuning = WORLD
+    tuning, team_tuning = WORLD, TEAM_WORLD

@@ -147,3 +147,4 @@ TEAM = Tuning(
     loop_scale=0.911,
     delay=2.18,
 )
+TEAM_CALM, TEAM_WORLD = TEAM, TEAM

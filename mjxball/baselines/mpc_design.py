@@ -77,7 +77,6 @@ class MpcDesign(NamedTuple):
     correction: Float[Array, "3 3"]  # E, on a correction v of the mean of all drones' commands
     cost: Float[Array, " 3"]  # of the square of v
     led: Float[Array, "3 22"]  # the leader's command
-    far: Float[Array, "3 22"]  # part of the mean command for errors and their rates
     far_limit: Float[Array, " 3"]  # limits of the assembly's roll and pitch [rad] and lift [m/s2]
 
 
@@ -110,7 +109,7 @@ def design(config: Config, tuning: Tuning, mass: float) -> MpcDesign:
     assembly = known_model(config)
     model = hover_model(config, assembly, tuning.load, object_mass=mass)
     found = feedback(model, tuning.costs, assembly.gravity)
-    far, rest, led = found.position @ model.error + found.rows[3:6], found.rows[6:9], model.led
+    mean, led = found.position @ model.error + found.rows[3:6] + found.rows[6:9], model.led
     # What one command of all followers asks for: that of all drones minus the leader's.
     asked = model.commanded - model.led_drive
     to_followers = np.linalg.inv(asked)
@@ -120,11 +119,10 @@ def design(config: Config, tuning: Tuning, mass: float) -> MpcDesign:
         torque_drive=model.drive[:, :2] @ np.linalg.inv(model.inertia),
         gain=filter_gain(model, tuning, assembly.period),
         measured=model.measured,
-        feedback=to_followers @ (model.commanded @ (far + rest) - model.led_drive @ led),
+        feedback=to_followers @ (model.commanded @ mean - model.led_drive @ led),
         correction=to_followers @ model.commanded,
         cost=np.diag(regulated(model, tuning.costs, assembly.gravity)[1]),
         led=led,
-        far=far,
         far_limit=found.limit,
     )
 

@@ -61,7 +61,7 @@ def groups_of(track: str, draw: int) -> tuple[Group, ...]:
     """
     plants = TRACKS[track].flights(draw)
     if draw != STORED_DRAW:
-        return tuple(_found(track, draw, number, plant) for number, plant in enumerate(plants))
+        return tuple(sample_group(track, draw, number, plant) for number, plant in enumerate(plants))
     stored = read_stored(track)
     if len(stored["plants"]) != len(plants):
         raise changed(track)
@@ -77,7 +77,7 @@ def groups_of(track: str, draw: int) -> tuple[Group, ...]:
 def stored_form(track: str) -> dict[str, Any]:
     """What the file of a track stores: which candidates the flights of draw 0 are, and when the oracle arrives."""
     plants = TRACKS[track].flights(STORED_DRAW)
-    groups = [_found(track, STORED_DRAW, number, plant) for number, plant in enumerate(plants)]
+    groups = [sample_group(track, STORED_DRAW, number, plant) for number, plant in enumerate(plants)]
     rows = [
         {
             "moving": plant.moving,
@@ -152,8 +152,11 @@ def _flight(plant: PlantFlights, condition: str, which: int, scenario: Scenario,
     return Flight(condition, which, scenario, plant.radius_in(condition), arrival, deadline(arrival, plant.moving))
 
 
-def _found(track: str, draw: int, number: int, plant: PlantFlights) -> Group:
-    """The first candidates of each condition that the oracle succeeds in. Raises InputError after too many."""
+def sample_group(track: str, draw: int, number: int, plant: PlantFlights) -> Group:
+    """The first `plant.count` candidates of each condition that the oracle succeeds in.
+
+    Raises InputError if these are too few of all.
+    """
     flights: dict[str, list[Flight]] = {condition: [] for condition in CONDITIONS}
     coming = {condition: _candidates(track, draw, number, condition, plant) for condition in CONDITIONS}
     for _ in range(MOST_TRIES):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import pickle
-import sys
 
 import jax
 import numpy as np
@@ -84,7 +82,7 @@ def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
     np.testing.assert_allclose(
         command, expected if angles is None else turned_about_z(expected, -angles), rtol=1e-9, atol=1e-15
     )
-    assert follower.solved == follower.failed == 0
+    assert follower.solved == 0
 
 
 @rows("drones", [3, 6])
@@ -130,9 +128,8 @@ def test_the_program_is_solved_as_another_solver_does() -> None:
 
         options = {"maxiter": 5000, "ftol": 1e-15, "gtol": 1e-10}
         best = minimize(value, np.zeros(count), jac=True, method="L-BFGS-B", options=options)
-        first, known = program.corrections(x[None], HOVER)
-        assert known.all()
-        np.testing.assert_allclose(first[0], best.x[:3], atol=5e-3)  # [rad]; [m/s2]: OSQP's tolerance
+        first = program.corrections(x[None], HOVER)[0]
+        np.testing.assert_allclose(first, best.x[:3], atol=1e-5)  # [rad]; [m/s2]: what L-BFGS leaves
     assert program.solved > 0
 
 
@@ -148,7 +145,7 @@ def test_limits_are_kept_that_the_lqr_breaks(plant: Config) -> None:
         x, tilts, forces = np.zeros(len(own.transition)), [], []
         x[EX] = 0.5
         for _ in range(150):
-            first = program.corrections(x[None], hover)[0][0] if follows else np.zeros(3)
+            first = program.corrections(x[None], hover)[0] if follows else np.zeros(3)
             command = own.feedback @ x + own.correction @ first
             torque = limits.kp * (command[:2] - x[[ROLL, PITCH]]) - limits.kd * x[[ROLL_RATE, PITCH_RATE]]
             forces.append(hover + limits.rotors @ np.array([carried * command[2], *torque]))
@@ -157,7 +154,6 @@ def test_limits_are_kept_that_the_lqr_breaks(plant: Config) -> None:
         assert (max(tilts) < 1.05 * tuning.tilt_limit) == follows
         assert (np.min(forces) > -0.6 and np.max(forces) < limits.rotor_force + 0.6) == follows
         assert abs(x[EX]) < 0.05
-    assert program.failed == 0
 
 
 @rows("drones", [2, 4])
@@ -190,14 +186,13 @@ def test_a_load_near_the_rotors_limits_does_not_throw_it_over(heavy) -> None:
 
 
 def test_a_jax_program_calls_it_back(heavy) -> None:
-    """float32 and a tolerance of 1e-3 in the programs: a millimetre."""
+    """In float32: a millimetre."""
     follower = make_baseline("mpc", PAPER)
     batched = fly_compiled(PAPER, follower, heavy)
     recorded = simulate_batch(PAPER, [(follower, heavy)], "newton-euler")
     for mine, other in zip(batched, measure_batch(recorded, 2.5, PAPER.plant.rotor_force_max, 0), strict=True):
         assert mine.rmse == pytest.approx(other.rmse, abs=1e-3)
     assert follower.controller.solved > 100
-    assert follower.controller.failed == 0
 
 
 def test_it_has_no_derivative() -> None:
@@ -211,24 +206,10 @@ def test_it_has_no_derivative() -> None:
         jax.jacobian(command)(jax.numpy.zeros(18))
 
 
-def test_copies_solve_by_themselves(heavy) -> None:
-    follower = make_controller("mpc", PAPER)
-    observation = np.zeros(18)
-    observation[12:15] = 1.0
-    nobody = PrivilegedInfo(np.array(0.2), *[np.array(0.0)] * 3)
-    _, first = follower.step(follower.start(observation), observation, nobody)
-    again = pickle.loads(pickle.dumps(follower))
-    assert again.solved == 0 < follower.solved
-    np.testing.assert_array_equal(again.step(again.start(observation), observation, nobody)[1], first)
-
-
-def test_what_it_cannot_do_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_it_cannot_do_is_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match="free pair along x"):
         make_controller("mpc", configs.replace(PAPER, "plant.cg_axis", "y"))
     light = dataclasses.replace(TEAM.plant.drones[1], mass=0.8)
     drones = (TEAM.plant.drones[0], light, *TEAM.plant.drones[2:])
     with pytest.raises(InputError, match="drones that are alike"):
         make_controller("mpc", dataclasses.replace(TEAM, plant=dataclasses.replace(TEAM.plant, drones=drones)))
-    monkeypatch.setitem(sys.modules, "osqp", None)
-    with pytest.raises(InputError, match=r"mjxball\[mpc\]"):
-        make_controller("mpc", PAPER)
