@@ -147,7 +147,7 @@ TUNED: dict[str, Tuned] = {
     "lqg": Tuned(lqg.Lqg.tuning, lqg.design, _with("design", "lqg")),
     "lqg-team": Tuned(lqg.Lqg.team_tuning, lqg.design, _with("design", "lqg")),
     "oracle": Tuned(
-        oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning, (1.0,))[0], _with("gains", "oracle")
+        oracle.Oracle.tuning, lambda config, tuning: oracle.gains(config, tuning)[0], _with("gains", "oracle")
     ),
     "mpc": Tuned(mpc.Mpc.tuning, None, mpc.Mpc),
     "mpc-team": Tuned(mpc.Mpc.team_tuning, None, mpc.Mpc),

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tables import rows
 
 from mjxball.baselines import make_baseline, make_controller
+from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, WorldCrazyflieLqg
 from mjxball.baselines.hover_model import ERRORS, LIFT_ERROR, LOAD, MEASURED, RATES, STATES, WIND
-from mjxball.baselines.lqg import MEMORY, Lqg, apart, noises
+from mjxball.baselines.lqg import MEMORY, CalmLqg, Lqg, WorldLqg, apart, noises
 from mjxball.baselines.lqg_tuning import LONGEST_DELAY, Tuning
 from mjxball.config import Config, preset, with_plant
 from mjxball.control.followers import PrivilegedInfo
@@ -143,3 +145,19 @@ def test_it_knows_no_more_than_the_believed_mass() -> None:
     assert np.isfinite(command).all()
     assert state.given.shape == (3 * LONGEST_DELAY,)
     assert not controller.needs_privileged
+
+
+@rows(
+    "kind, plant, attribute",
+    [
+        (CalmLqg, PAPER, "tuning"),
+        (WorldLqg, preset("team"), "team_tuning"),
+        (WorldLqg, preset("universal"), "team_tuning"),
+        (CalmCrazyflieLqg, preset("flight"), "tuning"),
+        (WorldCrazyflieLqg, preset("flight"), "tuning"),
+    ],
+)
+def test_a_variant_has_the_tuning_for_its_condition(kind, plant, attribute, monkeypatch) -> None:
+    monkeypatch.setattr(kind, attribute, getattr(kind, attribute)._replace(delay=4.0))
+    delay, own = (float(make_controller(name, plant).design.delay) for name in ("lqg", kind.name))
+    assert own == 4.0 != delay
