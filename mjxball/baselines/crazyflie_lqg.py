@@ -81,8 +81,59 @@ class Tuning(NamedTuple):
         return Decay(self.load_rate_time, self.load_time, self.lift_time, self.wind_time)
 
 
-BOTH = Tuning()  # for both conditions of the benchmark
-CALM, WORLD = BOTH, BOTH
+# For both conditions of the benchmark, and for one: 44 % of 48 calm flights of the search, 79 % of those in the world,
+# after 1920 sets each.
+BOTH = Tuning()
+CALM = Tuning(
+    y=0.145,
+    vy=0.544,
+    height=0.138,
+    climb=0.304,
+    rate=3.51,
+    thrust_difference=0.499,
+    roll_change=0.789,
+    vertical_change=27.8,
+    error_limit=0.138,
+    load_rate_walk=0.0344,
+    load_walk=0.00612,
+    lift_walk=0.0143,
+    wind_walk=0.232,
+    rate_walk=0.181,
+    velocity_walk=0.0999,
+    load_rate_time=2.27,
+    load_time=9.15,
+    lift_time=13.9,
+    wind_time=68.3,
+    velocity_noise=0.0844,
+    angle_noise=0.006,
+    rate_noise=0.0261,
+    delay=22.4,
+)
+WORLD = Tuning(
+    y=0.254,
+    vy=0.756,
+    height=0.125,
+    climb=0.238,
+    rate=2.9,
+    thrust_difference=0.501,
+    roll_change=0.525,
+    vertical_change=35.8,
+    error_limit=0.211,
+    load_rate_walk=0.00243,
+    load_walk=0.00363,
+    lift_walk=0.0209,
+    wind_walk=0.191,
+    rate_walk=0.105,
+    velocity_walk=0.0401,
+    load_rate_time=0.72,
+    load_time=6.46,
+    lift_time=48.8,
+    wind_time=24.3,
+    velocity_noise=0.116,
+    angle_noise=0.00367,
+    rate_noise=0.0311,
+    delay=16.2,
+)
 
 
 def changes(model: LinearModel, costs: Costs, period: float) -> Float[np.ndarray, "2 n+2"]:
