@@ -33,7 +33,7 @@ CLASSICAL = {
 TRAINED = {"sac": "**`sac`**: learned by SAC", "balance": "**`balance`**: learned by gradients"}
 MINUTE = "transport-sac"  # what README trains
 COLUMNS = (
-    *("follower", "success [%]", "mass unknown [%]", "arrival over the oracle's", "90 % of late errors below [mm]"),
+    *("follower", "success [%]", "mass unknown [%]", "arrival over the oracle's", "90 % of flights then within [mm]"),
     "rotor at its limit [%]",
 )
 
@@ -55,7 +55,7 @@ def row(text: str, tracks: Tracks) -> str:
 
 
 def best(found: dict[str, Tracks], track: str, condition: str) -> str:
-    """Followers that succeed most often, and how often: learned and classical ones, the better kind first."""
+    """The learned and the classical followers that succeed most often, and how often; the better kind first."""
     kinds = []
     for kind, names in (("learned", TRAINED), ("classical", CLASSICAL)):
         count = {name: found[name][track][condition]["succeeded"] for name in names if track in found.get(name, {})}
@@ -64,7 +64,7 @@ def best(found: dict[str, Tracks], track: str, condition: str) -> str:
             who = ", ".join(f"`{name}`" for name, succeeded in count.items() if succeeded == most)
             flights = next(found[name][track][condition]["flights"] for name in count)
             kinds.append((most, f"{kind} {who} ({100 * most / flights:.0f} %)"))
-    return " before ".join(text for _, text in sorted(kinds, key=lambda one: -one[0])) if len(kinds) == 2 else ""
+    return ", ".join(text for _, text in sorted(kinds, key=lambda one: -one[0])) if len(kinds) == 2 else ""
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
@@ -73,7 +73,7 @@ def sentences(found: dict[str, Tracks]) -> list[str]:
     for track, title in TRACKS.items():
         order = {condition: best(found, track, condition) for condition in CONDITIONS}
         if all(order.values()):
-            said.append(f"{title.capitalize()}: calm {order['calm']}; world {order['world']}.")
+            said.append(f"Best, {title}: calm {order['calm']}; world {order['world']}.")
     with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
         parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
     said.append(f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1))

@@ -91,8 +91,7 @@ def trainers() -> Iterator[tuple[str, Numbers]]:
 
 def crazyflies() -> Iterator[tuple[str, Numbers]]:
     for row in measured("crazyflie")["flight"]:
-        name = row["follower"].replace("lqg", "a former LQG")  # flown before the search on the benchmark's tracks
-        yield name, [row["crashes"], row["rmse"], row["rmse, worst of 99 %"]]
+        yield row["follower"], [row["crashes"], row["rmse"], row["rmse, worst of 99 %"]]
 
 
 def onboard() -> Iterator[tuple[str, Numbers]]:

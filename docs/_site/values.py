@@ -20,6 +20,9 @@ import numpy as np
 REPOSITORY = Path(__file__).parents[2]
 sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "benchmarks")]
 
+from mjxball.bench import CONDITIONS  # noqa: E402
+from mjxball.bench.draw import STORED_DRAW, read_stored  # noqa: E402
+from mjxball.bench.tracks import TRACKS, candidate  # noqa: E402
 from mjxball.cli import plant_setup  # noqa: E402
 from mjxball.config import Autopilot, preset, total_mass  # noqa: E402
 from mjxball.control import crazyflie, motors  # noqa: E402
@@ -47,6 +50,8 @@ MODULES = (  # known by their last name
         "mjxball.physics.engine",
         "mjxball.sim.sensors",
     ),
+    *("mjxball.bench", "mjxball.sim.rigs"),
+    *(f"mjxball.bench.{name}" for name in ("conditions", "draw", "success", "tracks")),
     *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),
     *("mjxball.train.program", "mjxfly.app.protocol", "mjxfly.view.live"),
     *(
@@ -97,6 +102,29 @@ def rounding(pivot: bool) -> float:
     """Largest relative difference between the engines' accelerations, on the pivot or elsewhere."""
     own = [row for row in results("engines")["rows"] if (row["stand"] == "pivot") is pivot]
     return max(row[name] for row in own for name in row if "form" in name or "MJX" in name)
+
+
+def span(ends: tuple[float, float], factor: float = 1.0) -> str:
+    """A range, times `factor`."""
+    return " - ".join(f"{factor * end:g}" for end in ends)
+
+
+@functools.cache
+def oracle_share(track: str) -> str:
+    """calm/world: of the candidates of draw 0 whose load can be trimmed, those that the oracle succeeds in [%]."""
+    shares = []
+    for condition in CONDITIONS:
+        tried = kept = 0
+        for number, (plant, stored) in enumerate(
+            zip(TRACKS[track].flights(STORED_DRAW), read_stored(track)["plants"], strict=True)
+        ):
+            found = [which for which, _ in stored[condition]]
+            candidates = (
+                candidate(track, STORED_DRAW, number, condition, which, plant.sample) for which in range(found[-1] + 1)
+            )
+            tried, kept = tried + sum(one is not None for one in candidates), kept + len(found)
+        shares.append(f"{100 * kept / tried:.0f}")
+    return "/".join(shares)
 
 
 ten_minutes = {

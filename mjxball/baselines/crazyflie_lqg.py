@@ -208,7 +208,7 @@ class LqgState(NamedTuple):
     expected: Array  # (..., n) states of the model at the time of the next measurement
     commands: Array  # (..., 16) the last eight: roll [rad] and vertical acceleration [m/s2], the newest first
     integral: Any  # (..., 3) see `CopiedPid`
-    steps: Array  # (...) so far
+    steps: Array  # (...) so far, at most `LONGEST_DELAY`
 
 
 class CrazyflieLqg:
@@ -248,7 +248,7 @@ class CrazyflieLqg:
         # The first measurements are of the start, where nothing moves.
         expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
         integral, copied = self._pid.step(state.integral, observation)
-        after = LqgState(expected, commands[..., :-2], integral, state.steps + 1.0)
+        after = LqgState(expected, commands[..., :-2], integral, xp.minimum(state.steps + 1.0, LONGEST_DELAY))
         return after, self._actuators.sent(command, copied)
 
 

@@ -196,7 +196,7 @@ class LqgState(NamedTuple):
 
     expected: Array  # (..., 22) state at the time of the next measurement
     given: Array  # (..., 12) what the followers' last four commands asked for, the newest first
-    steps: Array  # (...) so far
+    steps: Array  # (...) so far, at most `LONGEST_DELAY`
 
 
 class Lqg:
@@ -239,7 +239,7 @@ class Lqg:
         moved = times(own.transition, x) + times(own.drive, before)
         # The first measurements are of the start, where nothing moves.
         expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
-        return LqgState(expected, given[..., :-3], state.steps + 1.0), model.own(commands)
+        return LqgState(expected, given[..., :-3], xp.minimum(state.steps + 1.0, LONGEST_DELAY)), model.own(commands)
 
 
 class CalmLqg(Lqg):

@@ -29,14 +29,14 @@ from mjxball.reading import parse_json
 from mjxball.sim.scenario import Scenario
 
 STORED_DRAW = 0
-LEFT = 5.0  # time of a flight that is left after the deadline [s], in which the object must stay
-MOST_TRIES = 20  # candidates over wanted flights, of which so few suffice that the track is no track for the oracle
+LEFT = 5.0  # least time between the deadline and the end of a flight [s]
+MOST_TRIES = 20  # largest number of candidates for each flight wanted, before an error says that the oracle fails
 # Parts of a configuration that act on a flight.
 ACTING = ("plant", "attitude", "autopilot", "leader", "command", "timing", "motion")
 
 
 class Flight(NamedTuple):
-    """One flight of a draw."""
+    """One flight of a draw: a candidate that the oracle succeeds in."""
 
     condition: str
     candidate: int  # its number

@@ -1,8 +1,8 @@
 """The one definition of success, and the summary of a track's flights.
 
 A flight succeeds if the object reaches its goal at most 25 % later than with the oracle, a controller that knows
-everything, and stays there, with no rotor at its limit for more than 5 % of the time. "There" is a radius about the
-goal, see `mjxball.bench.tracks`. A goal that moves must be followed within the radius from 3 s on.
+everything, and stays there to the end, with no rotor at its limit for more than 5 % of the time. "There" is within a
+radius about the goal, see `mjxball.bench.tracks`. A goal that moves must be followed within the radius from 3 s on.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROUNDING = 1e-9  # of a time [s]
 CONFIDENCE = 0.95  # of the interval of the share of successes (Wilson 1927)
 # Why flights do not succeed. A crash has no other reason, and late and leaves exclude each other.
 REASONS = {
-    "crashed": "|e_o| beyond d_term, or a value that is not finite",
+    "crashed": "O is farther from the goal than scenario.termination_distance, or a value is not finite",
     "late": "the object is within the radius for the first time after the deadline, or never",
     "leaves": "it was there in time, but is beyond the radius after the deadline",
     "rotors": f"a rotor is at its limit for more than {100 * MAX_ROTOR_SHARE:g} % of the time",

@@ -1,7 +1,7 @@
 """The tracks of mjxball-bench: plants, and how flights on them are sampled.
 
-A draw is the seed of all flights. The leaderboard uses draw 0; other draws are flights that nobody tuned to. Both
-conditions have flights of their own, so that no calm flight tells of a disturbed one.
+A draw is the seed of all flights. The leaderboard uses draw 0; other draws are flights that nobody tuned to. The
+conditions have different flights, so that no follower can recognise a calm flight in the world.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ RATIOS = (1.0, 1.5, 2.0)  # of both speeds of a path
 RIGS, EACH_RIG = (2, 3, 4, 5, 6), 3  # drones of a rig, flights of each rig
 GOAL_SPEED, CIRCLES = (0.1, 0.5), (0.3, 1.0)  # of goals that move [m/s], radii of their circles [m]
 RAMP = (3.0, 15.0)  # ends of ramps [s], in one flight of two
-# A flight sampled with a generator for a condition; None: it cannot be trimmed.
+# Samples a flight in a condition; None: its load cannot be trimmed.
 Sampler = Callable[[np.random.Generator, str], Scenario | None]
 
 
@@ -47,7 +47,7 @@ Sampler = Callable[[np.random.Generator, str], Scenario | None]
 class PlantFlights:
     """How flights on one plant are sampled.
 
-    `config` is what a follower knows: the nominal plant. What a flight's plant really is stands in its scenario.
+    `config` is the nominal plant, which followers know; its deviations in a flight are in the scenario.
     """
 
     config: Config

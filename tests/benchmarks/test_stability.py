@@ -45,8 +45,8 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
 
 @pytest.mark.release
 def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
-    """LQG, which is told of no delay, bears one control step and not two."""
-    lqg, margin = make_baseline("lqg", paper), 1
+    """The hover of `lqg` with the CG at O bears a delay of two control steps and not of three."""
+    lqg, margin = make_baseline("lqg", paper), 2
     hovers = [linearised_hovers(paper, controller_of(lqg), CASES[:1], delay)[0] for delay in (margin, margin + 1)]
     assert [hover.stable for hover in hovers] == [True, False]
     still = {"amplitude": 0.0, "goal": (0.0, 0.0, 0.0), "start_position": (0.001, 0.0, 0.0)}
