@@ -42,17 +42,17 @@ ERROR = slice(12, 15)
 ERROR_RATE = slice(15, 18)
 
 
-def own_state(
-    position: Array, matrix: Array, velocity: Array, rates: Array, mount: Array
-) -> tuple[Array, Array, Array, Array]:
-    """A follower's position, (roll, pitch, yaw), velocity and body rates, each (..., 3), from the object's state.
+def own_state(position: Array, matrix: Array, velocity: Array, rates: Array, mount: Array) -> Array:
+    """A follower's position, (roll, pitch, yaw), velocity and body rates (..., 12) from the object's state.
 
     `position`, `velocity` of O in the world (..., 3), attitude `matrix` (..., 3, 3), body `rates` (..., 3), follower
     `mount` in body axes (..., 3); they broadcast.
     """
+    xp = position.__array_namespace__()
     follower = position + rotations.rotate(matrix, mount)
     follower_velocity = velocity + rotations.rotate(matrix, rotations.cross(rates, mount))
-    return follower, rotations.euler_from_matrix(matrix), follower_velocity, rates
+    parts = (follower, rotations.euler_from_matrix(matrix), follower_velocity, rates)
+    return xp.concat([xp.broadcast_to(part, follower.shape) for part in parts], axis=-1)
 
 
 def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal: Array, mount: Array) -> Array:
@@ -61,7 +61,8 @@ def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal:
     `goal` of O (..., 3) stands still, so de_o/dt = -velocity.
     """
     xp, own = position.__array_namespace__(), own_state(position, matrix, velocity, rates, mount)
-    return xp.concat([xp.broadcast_to(part, own[0].shape) for part in (*own, goal - position, -velocity)], axis=-1)
+    errors = (xp.broadcast_to(part, (*own.shape[:-1], 3)) for part in (goal - position, -velocity))
+    return xp.concat([own, *errors], axis=-1)
 
 
 def mount_angles(plant: Plant, mounts: Array | None = None) -> Array | None:

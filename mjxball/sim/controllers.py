@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Vector
 
     Observation = Float[Array, "... 18"]
-    OwnState = tuple[Vector, Vector, Vector, Vector]  # of each follower: position, (roll, pitch, yaw), velocity, rates
     Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID controller
 
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
@@ -107,7 +106,6 @@ class Controllers:
         if self._several:
             origin = tuple(xp.expand_dims(part, axis=state.position.ndim - 1) for part in origin)
         own = layout.own_state(*origin, xp.asarray(self._follower_mounts, dtype=state.position.dtype))
-        # The tilted mount's way across is locked as well: it is seen in roll.
         return self._observation(self._without_locked_slots(own), origin, None, goal, goal_rate)
 
     def estimate(
@@ -138,14 +136,18 @@ class Controllers:
 
         p_O = p - R r and its rate, with R of the measured attitude; arguments else as for `observe`.
         """
-        body = self.in_body_axes(own)
-        parts = self._without_locked_slots(tuple(body[..., place : place + 3] for place in (0, 3, 6, 9)))
-        position, euler, velocity, rates = parts
-        matrix = rotations.matrix_from_quaternion(rotations.quaternion_from_euler(euler))
-        return self._observation(parts, (position, matrix, velocity, rates), self._follower_mounts, goal, goal_rate)
+        own = self._without_locked_slots(self.in_body_axes(own))
+        matrix = rotations.matrix_from_quaternion(rotations.quaternion_from_euler(own[..., ATTITUDE]))
+        point = (own[..., 0:3], matrix, own[..., 6:9], own[..., RATES])
+        return self._observation(own, point, self._follower_mounts, goal, goal_rate)
 
     def _observation(
-        self, own: OwnState, point: tuple[Array, ...], place: Any, goal: Vector, goal_rate: Vector | None
+        self,
+        own: Float[Array, "... 12"],
+        point: tuple[Array, ...],
+        place: Any,
+        goal: Vector,
+        goal_rate: Vector | None,
     ) -> Observation:
         """Observations of followers in states `own`, with the error of O or of the leader's place.
 
@@ -166,9 +168,10 @@ class Controllers:
             arm = xp.asarray(arm, dtype=position.dtype)
             error = error + rotations.rotate(matrix, arm)
             error_rate = error_rate + rotations.rotate(matrix, rotations.cross(rates, arm))
-        parts = (*own, *map(self._along_free_axes, (error, error_rate)))
-        shape = own[0].shape
-        return self._in_mount_frames(xp.concat([xp.broadcast_to(part, shape) for part in parts], axis=-1))
+        errors = [self._along_free_axes(error), self._along_free_axes(error_rate)]
+        if self._several:
+            errors = [xp.broadcast_to(part, (*own.shape[:-1], 3)) for part in errors]
+        return self._in_mount_frames(xp.concat([own, *errors], axis=-1))
 
     def _in_mount_frames(self, vectors: Array) -> Array:
         """`vectors` (..., [F,] 3 k) in body axes, in the followers' mount frames."""
@@ -298,13 +301,11 @@ class Controllers:
             return vector
         return vector * vector.__array_namespace__().asarray(self._free, dtype=vector.dtype)
 
-    def _without_locked_slots(self, own: OwnState) -> OwnState:
-        """`own` without motion along what the stand locks."""
+    def _without_locked_slots(self, own: Float[Array, "... 12"]) -> Float[Array, "... 12"]:
+        """Own states without motion along what the stand locks, the tilted mount's way across included."""
         if self._free is None:
             return own
-        position, euler, velocity, rates = own
-        rolls = rates.__array_namespace__().asarray(ROLLS, dtype=rates.dtype)
-        return self._along_free_axes(position), rolls * euler, self._along_free_axes(velocity), rolls * rates
+        return own * own.__array_namespace__().asarray([*self._free, *ROLLS] * 2, dtype=own.dtype)
 
     def _without_locked_motion(self, state: Body) -> Body:
         """`state` without motion along what the stand locks."""
