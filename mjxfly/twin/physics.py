@@ -59,9 +59,7 @@ class SimplePair:
     ):
         for name in COUPLED_ONLY:
             if getattr(surroundings, name) != getattr(QUIET, name):
-                raise InputError(
-                    f"the twin of plants that are no Crazyflie pair does not simulate the surroundings' {name}"
-                )
+                raise InputError(f"the twin of other plants than Crazyflies does not simulate surroundings.{name}")
         self.plant, self.kind, self.surroundings = plant, kind, surroundings
         self._mounts = np.array(plant.mounts)
         self._random = np.random.default_rng(surroundings.seed)
