@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from mjxball import cli, terminal
-from mjxball.config import Config
 from mjxball.control.crazyflie import PairGains
 from mjxball.errors import InputError
 from mjxball.policy import Policy, policy_path
@@ -44,7 +43,17 @@ from mjxfly.rehearsal import Rehearsal
 from mjxfly.session import FlightSetup, fly
 from mjxfly.setpoints import CURVE_NAMES
 from mjxfly.telemetry import Rig
-from mjxfly.twin.conditions import FAULT_KINDS, add_twin_options, check_surroundings, read_fault, twin_arguments
+from mjxfly.twin.conditions import (
+    FAULT_KINDS,
+    POSE_FAULTS,
+    BodyFault,
+    DroneFaults,
+    add_twin_options,
+    check_simple,
+    check_surroundings,
+    read_fault,
+    twin_arguments,
+)
 from mjxfly.uri import HERE, Udp, Uri, check_pair, parse_uri, share_dongle
 
 SLOW = ("slow", 1.0, clock.SLOWEST)
@@ -256,14 +265,11 @@ def check_twin_options(options: argparse.Namespace) -> None:
         raise InputError("--onboard cannot show that the axes of --mocap are right: leave one of them out")
     check_surroundings(options)
     for fault in options.fault:
-        read_fault(fault)
-
-
-def check_coupled(config: Config, options: argparse.Namespace) -> None:
-    """Raise InputError for flags that the twin of `config` does not support."""
-    for name in ("load", "mount"):
-        if getattr(options, f"twin_{name}") is not None and not is_crazyflie(config):
-            raise InputError(f"--twin-{name} is for policies that were trained on Crazyflies, such as flight")
+        what = read_fault(fault).what
+        if isinstance(what, DroneFaults) and what.peer_silent and not options.onboard:
+            raise InputError(f"--fault {fault} is for --onboard: else no drone hears the other")
+        if isinstance(what, BodyFault) and what.what in POSE_FAULTS and options.twin_deck == "no":
+            raise InputError(f"--fault {fault} is of the deck's poses, which --twin-deck no takes away")
 
 
 def rehearsed_options(options: argparse.Namespace) -> list[str]:
@@ -313,7 +319,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for path, given in parameters_of(options, swarm):
             check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
             more = {**more[0], **given[0]}, {**more[1], **given[1]}
-        check_coupled(config, options)
+        if not is_crazyflie(config):
+            check_simple(options, map(read_fault, options.fault))
         check_mount(config, variants(config, choice, more), mount_of(options, config.plant))
         rig = Rig.from_metadata(policy.metadata)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)

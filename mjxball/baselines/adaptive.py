@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,11 +21,15 @@ CRAZYFLIE_BANDWIDTH = 4.0  # for two Crazyflies [rad/s]; of 2 to 9 tried on rand
 CRAZYFLIE_RATE = 4.0  # largest rate of their load's moment over the moment that the tilt limit holds [1/s]
 MASS_GAIN, TEAM_MASS_GAIN = 0.5, 4.0  # Gamma of a pair and of a team
 MASS_SLOPE, MASS_LIMIT = 0.35, 0.5  # [1/s], per follower [kg]
+MEMORY, MASS_MEMORY = 0.5, 20.0  # time constants with which estimates of several followers fade [s]
 CORRECTION_LIMIT = 0.5  # [rad] of roll and pitch, with mass adaptation
 
 
 class AdaptiveState(NamedTuple):
-    """State of the adaptive follower, in body axes; A is the number of axes about which the load acts."""
+    """State of the adaptive follower, in body axes; A is the number of axes about which the load acts.
+
+    Arrays of several followers are (..., F, ...).
+    """
 
     integral: Any  # (..., 3) see `CopiedPid`
     desired: Array  # (..., A) last tilt command of the copied PID about the load's axes [rad]
@@ -40,14 +45,16 @@ class Adaptive:
     """s = (q - theta_d') + lam (theta - theta_d); d' = v + G1 (g + az) s, v' = G2 (g + az) s, about each load's axis.
 
     theta_d is the copied command, lam = Kp / Kd of a drone's attitude loop, K = N Kd of all N drones, G1 = K w_b / g^2,
-    G2 = G1 w_b r / 2. The followers share a torque against (g + az) d, by rotor torque and by unequal lift
-    (`AssemblyModel.corrections`); for a pair theta_f = theta_d - (g + az) d / Kp. With `adapts_mass` the object's mass
-    is estimated from the height relative to an ideal PD response, and the followers lift its weight without a moment.
-    The other axis of a pair is copied. If the leader has an integral, it is copied too, so that all lift alike. The
-    extra thrust of Crazyflie motors at unequal commands is subtracted.
+    G2 = G1 w_b r / 2. Every follower gives one F-th of the torque against (g + az) d; for a pair
+    theta_f = theta_d - (g + az) d / Kp. With `adapts_mass` the object's mass is estimated from the height relative to
+    an ideal PD response, and the followers lift its weight without a moment. The other axis of a pair is copied. If the
+    leader has an integral, it is copied too, so that all lift alike. The extra thrust of Crazyflie motors at unequal
+    commands is subtracted.
 
-    For teams r = 1 and Gamma = 4 were best among r of 0.5 and 1, w_b of 4 to 12 and Gamma of 0.5 to 16: at r = 0.5 the
-    largest error is up to twice as large, and at w_b = 8 they diverge under noise and 40 ms of delay.
+    Followers of a team estimate from their own measurements. Sensors that disagree by constants would drive their
+    estimates apart for ever, so these fade (Ioannou's sigma modification), and a slow load is not cancelled
+    completely. Constant errors of level 1 keep rotors of `team4` at a limit for half of the time if estimates fade
+    with 1 s, and those of `team6` from 0.6 s on.
     """
 
     needs_privileged = False
@@ -57,7 +64,7 @@ class Adaptive:
         self._pid = CopiedPid(config)
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._height = (config.leader.kp[2], config.leader.kd[2])
-        self._model = model = assembly_model(config, self.name)
+        self._model = model = assembly_model(config, self.name).each_alone()
         self._adapts_mass = adapts_mass
         drones, followers = len(model.own_mass), model.followers
         kp, kd = np.array(model.kp)[model.turned], np.array(model.kd)[model.turned]
@@ -69,10 +76,13 @@ class Adaptive:
         self._gains = kp / kd, first, first * bandwidth * ratio / 2.0  # lam, G1, G2 of each axis
         self._mass_gain = (MASS_GAIN if followers == 1 else TEAM_MASS_GAIN) / model.gravity
         self._mass_limit = followers * MASS_LIMIT
+        # Shares of the estimates that are left after a period.
+        kept = [math.exp(-model.period / memory) for memory in (MEMORY, MASS_MEMORY)]
+        self._kept, self._mass_kept = (1.0, 1.0) if followers == 1 else kept
 
     def start(self, observation: Array) -> AdaptiveState:
         """See `Controller.start`."""
-        xp, observation = observation.__array_namespace__(), self._model.seen(observation)
+        xp, observation = observation.__array_namespace__(), self._model.in_body_axes(observation)
         zero = xp.zeros_like(observation[..., 0])
         zeros = xp.zeros_like(observation[..., : len(self._model.axes)])
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
@@ -82,7 +92,7 @@ class Adaptive:
         """See `Controller.step`."""
         xp, model, axes = observation.__array_namespace__(), self._model, self._model.turned
         slope, first, second = (xp.asarray(gain, dtype=observation.dtype) for gain in self._gains)
-        observation = model.seen(observation)
+        observation = model.in_body_axes(observation)
         integral, copied = self._pid.step(state.integral, observation)
         desired, vertical = copied[..., axes], copied[..., 2]
         theta, rate = observation[..., 3:5][..., axes], observation[..., 9:11][..., axes]
@@ -90,12 +100,13 @@ class Adaptive:
         s = (rate - desired_rate) + slope * (theta - desired)
         weight = (model.gravity + vertical)[..., None]
         most, most_rate = self._estimate_limits
-        moment = xp.clip(state.moment + model.period * (state.rate + first * weight * s), -most, most)
-        moment_rate = xp.clip(state.rate + model.period * second * weight * s, -most_rate, most_rate)
+        kept = self._kept
+        moment = xp.clip(kept * state.moment + model.period * (state.rate + first * weight * s), -most, most)
+        moment_rate = xp.clip(kept * state.rate + model.period * second * weight * s, -most_rate, most_rate)
         after = state._replace(
             integral=integral, desired=desired, moment=moment, rate=moment_rate, started=xp.ones_like(state.started)
         )
-        carried, lift = model.carried(model.of_flight(privileged.believed_mass)), xp.zeros_like(vertical)
+        carried, lift = model.carried(privileged.believed_mass), xp.zeros_like(vertical)
         if self._adapts_mass:
             after = self._mass(after, observation, carried)
             lift = model.gravity * after.extra_mass
@@ -106,14 +117,14 @@ class Adaptive:
             tilt = xp.clip(tilt, -CORRECTION_LIMIT, CORRECTION_LIMIT)
         lift = model.without_extra_lift(vertical[..., None] + correction[..., 2], tilt)
         command = xp.concat([copied[..., None, :2] + tilt, lift[..., None]], axis=-1)
-        return after, model.sent(clip_command(command, *self._limits))
+        return after, model.own(clip_command(command, *self._limits))
 
     def _mass(self, state: AdaptiveState, observation: Array, carried: Array) -> AdaptiveState:
         """`state` with the extra mass that explains the height; `carried` (..., N) are the drones' assumed masses."""
         xp, period = observation.__array_namespace__(), self._model.period
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
         s = (state.error_rate - error_rate) + MASS_SLOPE * (state.error - error)
-        mass = state.extra_mass - period * carried.sum(axis=-1) * self._mass_gain * s
+        mass = self._mass_kept * state.extra_mass - period * carried.sum(axis=-1) * self._mass_gain * s
         kp, kd = self._height
         return state._replace(
             extra_mass=xp.clip(mass, -self._mass_limit, self._mass_limit),

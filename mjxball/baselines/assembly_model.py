@@ -21,9 +21,8 @@ SIGNS = (-1.0, 1.0)  # of the roll torque of a load at +y, of the pitch torque o
 class AssemblyModel(NamedTuple):
     """N drones about roll and pitch, body axes, and how F = N - 1 followers share a wrench.
 
-    One controller commands all followers of a team, on the mean of what they measure: estimates of one quantity that
-    each of them integrates for itself drift apart under noise, for the motion shows their sum alone. Its state has no
-    followers' axis, nor have a pair's arrays.
+    A follower finds what all of them should do from its own measurements, and sends its own command of that (`own`).
+    Arrays of several followers have an axis F for it, those of a pair's one have none.
     """
 
     axes: tuple[int, ...]  # about which the load turns the assembly: 0 roll, 1 pitch
@@ -47,14 +46,6 @@ class AssemblyModel(NamedTuple):
     natural_frequency: tuple[float, float]  # of the closed roll and pitch loops of `Attitude` [rad/s]
     damping: float
 
-    def seen(self, observation: Array) -> Array:
-        """Mean (..., 18) in body axes of all followers' `observation` (..., F, 18) in mount frames; a pair's as it is.
-
-        Also of other vectors (..., F, 3 k) in mount frames.
-        """
-        turned = observation if self.angles is None else rotations.turned_about_z(observation, self.angles)
-        return turned if self.followers == 1 else turned.mean(axis=-2)
-
     def in_body_axes(self, observation: Array) -> Array:
         """`observation` (..., 18), of several followers (..., F, 18), in body axes; also other vectors (..., 3 k)."""
         return observation if self.angles is None else rotations.turned_about_z(observation, self.angles)
@@ -65,19 +56,10 @@ class AssemblyModel(NamedTuple):
         One follower's are (..., 1, 3) and become (..., 3).
         """
         if self.followers == 1:
-            return self.sent(commands)
-        chosen = np.eye(self.followers, dtype=commands.dtype)[..., None]
-        mine = (commands * chosen).sum(axis=-2)
+            mine = commands[..., 0, :]
+        else:
+            mine = (commands * np.eye(self.followers, dtype=commands.dtype)[..., None]).sum(axis=-2)
         return mine if self.angles is None else rotations.turned_about_z(mine, -self.angles)
-
-    def sent(self, commands: Array) -> Array:
-        """All followers' `commands` (..., F, 3) in their mount frames; the one's of a pair without their axis."""
-        own = commands[..., 0, :] if self.followers == 1 else commands
-        return own if self.angles is None else rotations.turned_about_z(own, -self.angles)
-
-    def of_flight(self, values: Array, axes: int = 0) -> Array:
-        """A value of `PrivilegedInfo` that is the same for all followers, without their axis before the last `axes`."""
-        return values if self.followers == 1 else values.take(0, axis=values.ndim - axes - 1)
 
     def of_followers(self, values: Array) -> Array:
         """(..., F) of `values` (..., N) of all drones."""
@@ -111,6 +93,14 @@ class AssemblyModel(NamedTuple):
             asked = inverse_cost * matmul(effect.mT, price[..., None, :, :])[..., 0]
         vertical = asked[..., 0] / self.of_followers(carried)
         return xp.concat([asked[..., 1:] / kp, vertical[..., None]], axis=-1)
+
+    def each_alone(self) -> AssemblyModel:
+        """The model in which every follower gives one F-th of a wrench about O by itself, by lift and rotor torques.
+
+        Of what followers disagree about only the mean then acts on the assembly; shared by unequal lifts, all would.
+        """
+        alone = np.linalg.inv(self.effect) / self.followers
+        return self if self.followers == 1 else self._replace(asked_per_wrench=alone)
 
     @property
     def turned(self) -> slice:

@@ -198,9 +198,10 @@ def oracle_arrivals(
 
 
 def with_perfect_sensors(scenario: Scenario) -> Scenario:
-    """`scenario` as the oracle flies it: no sensor errors, delay and jitter, the true mass; plant and air stay.
+    """`scenario` as the oracle flies it: exact sensors without delay, the true mass; plant and air stay.
 
-    Errors of the attitude, which are of the sensors, act on no loop either.
+    Errors of the attitude are of the sensors, so no loop has them either. Jitter counts as an error of the sensors: the
+    oracle's commands are never late, other followers' are.
     """
     rough = scenario.disturbance
     kept = dataclasses.replace(type(rough)(), gust=rough.gust, gust_seed=rough.gust_seed)

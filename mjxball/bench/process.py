@@ -30,7 +30,7 @@ from mjxball.evaluate.followers import MAX_COMMAND
 PACKAGE = Path(__file__).parents[2]
 # Time that a follower may take by the clock in all: so much, and more for every control step of every flight [s].
 PATIENCE, PATIENCE_PER_STEP = 60.0, 2 * MAX_CPU_TIME
-WARM_UP, CALLS = 20, 100  # calls before the CPU time is measured, and measured ones
+WARM_UP, CALLS = 20, 100  # calls before CPU time is measured, and measured ones of a check before the flights
 OUTPUT_LINES, LINE = 20, 200  # of what the follower prints: last lines that are kept, and characters of each
 # One thread: CPU time is that of the follower's arithmetic, and the order of sums is always the same.
 ENVIRONMENT = {
@@ -52,6 +52,7 @@ class FollowerProcess:
 
     def __init__(self, name: str, text: str):
         self.name, self._patience, self._made = name, PATIENCE, 0
+        self.answered = 0  # control steps of flights so far, each flight's counted
         receive, self._send = os.pipe()
         self._receive, send = os.pipe()
         command = [sys.executable, "-P", "-m", "mjxball.bench.child", str(receive), str(send), text]
@@ -142,6 +143,7 @@ class FollowerProcess:
             self._patience -= time.monotonic() - begun
         if found == frames.ERROR:
             raise RefusalError(_printable(answer[: frames.MAX_TEXT].decode("utf-8", "replace")))
+        self.answered += steps
         return answer
 
     def _write(self, content: bytes, until: float) -> None:
@@ -186,28 +188,42 @@ class FollowerProcess:
 class RemoteFollower:
     """A `mjxball.control.followers.Follower` that asks its process. Commands are checked, then clipped as everybody's.
 
-    Set `believed_mass` (n,) [kg] of n flights before a reset.
+    Set `believed_mass` (n,) [kg] of n flights before a reset. `slowest` is the largest CPU time of a call over the
+    number of flights that it answers [s], without the first `WARM_UP` calls after a reset, in which programs compile.
+    Where the operating system counts coarsely, it is that of `cpu.CALLS` calls and of what the process does meanwhile.
     """
 
     def __init__(self, process: FollowerProcess, number: int, config: Config, residual_on_pid: bool):
         self.name, self.residual_on_pid, self._number = process.name, residual_on_pid, frames.NUMBER.pack(number)
         self.believed_mass: np.ndarray = np.zeros(0)
+        self.slowest, self._calls, self._begun = 0.0, 0, (0.0, 0)
         self._process, self._limits = process, (config.command.tilt_limit, config.command.vertical_limit)
 
     def reset(self) -> None:
         """See `Follower.reset`."""
+        self.slowest, self._calls = 0.0, 0
         self._process.ask(frames.RESET, self._number + frames.packed(self.believed_mass), frames.READY)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """See `Follower.__call__`; InputError if it sends no command."""
         sent = self._number + frames.packed(observation)
+        if self._calls % cpu.CALLS == 0:
+            self._begun = self._process.cpu_time, self._process.answered
         content = self._process.ask(frames.OBSERVATION, sent, frames.COMMAND, len(observation))
+        self._count_time()
         command = checked_command(self.name, frames.unpacked(content), observation)
         if not (np.abs(command) <= MAX_COMMAND).all():
             raise InputError(
                 f"follower {self.name} answered a number that is not finite, or larger than {MAX_COMMAND:g}"
             )
         return clip_command(command, *self._limits)
+
+    def _count_time(self) -> None:
+        self._calls += 1
+        if self._calls % cpu.CALLS == 0 and self._calls > WARM_UP:
+            begun, answered = self._begun
+            taken = (self._process.cpu_time - begun) / (self._process.answered - answered)
+            self.slowest = max(self.slowest, taken)
 
 
 def _drain(stream: IO[bytes], kept: deque[str]) -> None:

@@ -19,7 +19,9 @@ from mjxball.evaluate.metrics import Metrics
 LATER = 1.25  # largest arrival over that of the oracle
 MOVING_DEADLINE = 3.0  # from which on a goal that moves must be followed [s]
 MAX_ROTOR_SHARE = 0.05  # of the time at a limit, of any one rotor
-MAX_CPU_TIME = 0.020  # of the follower for one control step of one flight [s]
+# CPU time of the follower for one control step of one flight [s]: that of the slowest call for all flights on a plant
+# over their number, but for the first calls (`process.RemoteFollower`). No step of one flight alone is timed.
+MAX_CPU_TIME = 0.020
 SOONEST = 0.1  # of an oracle's arrival that another is compared with; it may be there from the start [s]
 ROUNDING = 1e-9  # of a time [s]
 CONFIDENCE = 0.95  # of the interval of the share of successes (Wilson 1927)
@@ -29,7 +31,7 @@ REASONS = {
     "late": "the object is within the radius for the first time after the deadline, or never",
     "leaves": "it was there in time, but is beyond the radius after the deadline",
     "rotors": f"a rotor is at its limit for more than {100 * MAX_ROTOR_SHARE:g} % of the time",
-    "slow": f"a control step of one flight takes more than {1e3 * MAX_CPU_TIME:g} ms of CPU time",
+    "slow": f"a control step takes more than {1e3 * MAX_CPU_TIME:g} ms of CPU time for each flight on the plant",
 }
 
 
@@ -41,7 +43,7 @@ def deadline(oracle_arrival: float, moving: bool) -> float:
 def reasons(metrics: Metrics, deadline: float, cpu_time: float = 0.0) -> tuple[str, ...]:
     """Keys of `REASONS` why a flight does not succeed; () if it does.
 
-    `metrics` were measured with the flight's radius; `cpu_time` [s] is the follower's for a control step.
+    `metrics` were measured with the flight's radius; `cpu_time` [s] is that of `MAX_CPU_TIME`.
     """
     if metrics.failed:
         return ("crashed",)

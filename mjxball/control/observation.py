@@ -42,19 +42,27 @@ ERROR = slice(12, 15)
 ERROR_RATE = slice(15, 18)
 
 
-def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal: Array, mount: Array) -> Array:
-    """The 18 numbers of `OBSERVATION` (..., 18) from the object's state.
+def own_state(position: Array, matrix: Array, velocity: Array, rates: Array, mount: Array) -> Array:
+    """A follower's position, (roll, pitch, yaw), velocity and body rates (..., 12) from the object's state.
 
-    `position`, `velocity` of O in the world (..., 3), attitude `matrix` (..., 3, 3), body `rates` (..., 3),
-    `goal` of O (..., 3), follower `mount` in body axes (..., 3); they broadcast. The goal stands still, so
-    de_o/dt = -velocity.
+    `position`, `velocity` of O in the world (..., 3), attitude `matrix` (..., 3, 3), body `rates` (..., 3), follower
+    `mount` in body axes (..., 3); they broadcast.
     """
     xp = position.__array_namespace__()
     follower = position + rotations.rotate(matrix, mount)
     follower_velocity = velocity + rotations.rotate(matrix, rotations.cross(rates, mount))
-    euler = rotations.euler_from_matrix(matrix)
-    parts = (follower, euler, follower_velocity, rates, goal - position, -velocity)
+    parts = (follower, rotations.euler_from_matrix(matrix), follower_velocity, rates)
     return xp.concat([xp.broadcast_to(part, follower.shape) for part in parts], axis=-1)
+
+
+def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal: Array, mount: Array) -> Array:
+    """The 18 numbers of `OBSERVATION` (..., 18) from the object's state, arguments as for `own_state`.
+
+    `goal` of O (..., 3) stands still, so de_o/dt = -velocity.
+    """
+    xp, own = position.__array_namespace__(), own_state(position, matrix, velocity, rates, mount)
+    errors = (xp.broadcast_to(part, (*own.shape[:-1], 3)) for part in (goal - position, -velocity))
+    return xp.concat([own, *errors], axis=-1)
 
 
 def mount_angles(plant: Plant, mounts: Array | None = None) -> Array | None:

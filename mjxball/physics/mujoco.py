@@ -125,7 +125,10 @@ class MujocoWorld:
             wrench = Wrench(wrench.force - own.force, wrench.torque - own.torque)
             self.load_drones(state.rotor_force)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        force, torque = matrix @ wrench.force, matrix @ wrench.torque
+        self.pull(matrix @ wrench.force, matrix @ wrench.torque)
+
+    def pull(self, force: Vector, torque: Vector) -> None:
+        """Apply a force at O and a torque, world axes, to the assembly's body."""
         origin = self.data.xpos[self._shell]
         mujoco.mj_applyFT(self.model, self.data, force, torque, origin, self._shell, self.data.qfrc_applied)
 
@@ -200,7 +203,10 @@ def slide_force(
 def flown_contact_wrenches(
     config: Config, flown: PlantState, load: Load
 ) -> tuple[Float[np.ndarray, "T n drones 3"], Float[np.ndarray, "T n drones 3"]]:
-    """Contact forces [N] and torques [N m] of recorded states (T, n, ...) from MuJoCo's internal forces."""
+    """Contact forces [N] and torques [N m] of recorded states (T, n, ...) from MuJoCo's internal forces.
+
+    `load.external_force` (T, n, 3) acts on O. Rotors have no other air than at rest.
+    """
     world = MujocoWorld(config.plant, config.attitude)
     share, rolling = config.plant.moving_fraction, config.motion.kind == "rolling"
     mass = motion.object_mass(flown.time, load)
@@ -212,11 +218,13 @@ def flown_contact_wrenches(
         ball = CgState(ball.offset / share, ball.rate / share, ball.acceleration / share)
         drive = ball.acceleration
 
-    def one(state: PlantState, object_mass: float, ball: CgState, drive: Array) -> np.ndarray:
+    def one(state: PlantState, object_mass: float, ball: CgState, drive: Array, force: Array | None) -> np.ndarray:
         world.place(state, object_mass, ball.offset, ball.rate)
         world.load_drones(state.rotor_force)
+        if force is not None:
+            world.pull(force, np.zeros(3))
         world.roll(drive) if rolling else world.drive(drive)
         return world.contact_wrenches(state)
 
-    result = _each((flown, mass, ball, drive), flown.time.shape, one)
+    result = _each((flown, mass, ball, drive, load.external_force), flown.time.shape, one)
     return result[..., 0, :, :], result[..., 1, :, :]

@@ -8,6 +8,7 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.physics.engine import has_diverged
+from mjxball.physics.mounts import own_motion
 from mjxball.sim.controllers import Body, BodyState, Controllers
 from mjxball.sim.sensors import EXACT, OWN, SensorSettings
 
@@ -56,6 +57,7 @@ class ClosedLoop(Controllers):
         super().__init__(config, parameters)
         self._plant_step, self._sensors, self._jitters = plant_step, sensors, jitters
         self.period, self._count = config.timing.control_period, config.plant.count
+        self._yaw = np.array([drone.yaw for drone in config.plant.drones])
         self._leader_measures = config.scenario.leader_uses_measurements
 
     def start(
@@ -117,11 +119,15 @@ class ClosedLoop(Controllers):
         return LoopState(plant, integral, sensors, diverged, sent if self._jitters else ()), truth, commands
 
     def _truth(self, plant: PlantState, goal: Goal, load: Load) -> Observation:
-        """The observation without disturbances but constant errors of the attitude."""
+        """The observation without disturbances but constant errors of the attitude.
+
+        A drone on an elastic mount observes its own attitude and rates, and computes the object's error from them.
+        """
         seen = self.observe(plant, goal.position, goal.rate)
-        if load.attitude_error is None:
+        if plant.mount_angle is None and load.attitude_error is None:
             return seen
-        read = self.misread(seen, load.attitude_error)
+        own = None if plant.mount_angle is None else own_motion(plant, self._yaw)
+        read = self.estimate(seen, own, load.attitude_error)
         return read if self._sensors.object_sensor else self.observe_by(read[..., :OWN], goal.position, goal.rate)
 
     def _measurable(self, truth: Observation) -> Array:

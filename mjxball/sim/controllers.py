@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
 MAX_LIFT_DIFFERENCE = 1.5
 ATTITUDE, RATES = slice(3, 6), slice(9, 12)  # slots of an observation
+ROLLS = (1.0, 0.0, 0.0)  # what a stand leaves of an attitude
 WASHOUT_TIME = 8.0  # time constant of the high pass on what a network adds to both drones' PID controller [s]
 
 
@@ -97,71 +98,80 @@ class Controllers:
         self._mount_angles = layout.mount_angles(plant, mounts)
 
     def observe(self, state: Body, goal: Vector, goal_rate: Vector | None = None) -> Observation:
-        """Observations of the followers; `goal` of O [m], and its rate [m/s] if it moves."""
+        """Observations of followers that know the true `state`; `goal` of O [m], and its rate [m/s] if it moves."""
         xp = state.position.__array_namespace__()
-        state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
+        state = self._without_locked_motion(state)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        mount = xp.asarray(self._follower_mounts, dtype=state.position.dtype)
-        seen = (state.position, matrix, state.velocity, state.rates, goal)
+        origin = (state.position, matrix, state.velocity, state.rates)
         if self._several:
-            seen = tuple(xp.expand_dims(part, axis=state.position.ndim - 1) for part in seen)
-        observation = layout.observe(*seen, mount)
-        if self._free is not None:
-            # The tilted mount's way across is locked as well: it is seen in roll.
-            observation = xp.concat(
-                [
-                    self._along_free_axes(observation[..., 0:3]),
-                    observation[..., 3:6],
-                    self._along_free_axes(observation[..., 6:9]),
-                    observation[..., 9:],
-                ],
-                axis=-1,
-            )
-        if self._follower_sees == "leader":
-            place = xp.concat(self._leader_place_error(state, goal), axis=-1)
-            place = place[..., None, :] if self._several else place
-            own = observation[..., : layout.ERROR.start]
-            observation = xp.concat([own, xp.broadcast_to(place, (*own.shape[:-1], 6))], axis=-1)
-        if goal_rate is not None:
-            rate = self._along_free_axes(goal_rate)
-            rate = observation[..., layout.ERROR_RATE] + (rate[..., None, :] if self._several else rate)
-            observation = xp.concat([observation[..., : layout.ERROR_RATE.start], rate], axis=-1)
-        return self._in_mount_frames(observation)
+            origin = tuple(xp.expand_dims(part, axis=state.position.ndim - 1) for part in origin)
+        own = layout.own_state(*origin, xp.asarray(self._follower_mounts, dtype=state.position.dtype))
+        return self._observation(self._without_locked_slots(own), origin, None, goal, goal_rate)
 
-    def misread(self, observation: Observation, attitude_error: Float[Array, "... drones 3"]) -> Observation:
-        """The own states in `observation` as drones with `attitude_error` (see `Load`) estimate them."""
+    def estimate(
+        self,
+        observation: Observation,
+        own: tuple[Array, Array] | None,
+        attitude_error: Float[Array, "... drones 3"] | None,
+    ) -> Observation:
+        """The own states in `observation` as drones estimate them that are turned on their mounts.
+
+        `own`: roll, pitch, yaw [rad] and body rates [rad/s] of all drones (..., N, 3) on elastic mounts, see
+        `physics.mounts.own_motion`; None: those of the carrier. `attitude_error` of estimates, see `Load`; None: none.
+        """
         xp = observation.__array_namespace__()
-        error = attitude_error[..., self._followers if self._several else self._followers[0], :]
-        turn = error[..., 2]
-        attitude, rates = (rotations.turned_about_z(observation[..., part], -turn) for part in (ATTITUDE, RATES))
-        parts = [observation[..., :3], attitude + self._in_mount_frames(error), observation[..., 6:9], rates]
-        return xp.concat([*parts, observation[..., layout.ERROR.start :]], axis=-1)
+        drones = self._followers if self._several else self._followers[0]
+        attitude, rates = observation[..., ATTITUDE], observation[..., RATES]
+        if own is not None:
+            attitude, rates = (self._in_mount_frames(part[..., drones, :]) for part in own)
+        if attitude_error is not None:
+            error = attitude_error[..., drones, :]
+            attitude, rates = (rotations.turned_about_z(part, -error[..., 2]) for part in (attitude, rates))
+            attitude = attitude + self._in_mount_frames(error)
+        rest = observation[..., layout.ERROR.start :]
+        return xp.concat([observation[..., :3], attitude, observation[..., 6:9], rates, rest], axis=-1)
 
     def observe_by(self, own: Float[Array, "... 12"], goal: Vector, goal_rate: Vector | None = None) -> Observation:
         """Observations from the followers' own measured states `own`, from which each computes the object's error.
 
         p_O = p - R r and its rate, with R of the measured attitude; arguments else as for `observe`.
         """
-        xp = own.__array_namespace__()
-        body = own if self._mount_angles is None else rotations.turned_about_z(own, self._mount_angles)
-        if self._free is not None:
-            rolls = xp.asarray([1.0, 0.0, 0.0], dtype=own.dtype)
-            place, velocity = (self._along_free_axes(body[..., part]) for part in (slice(0, 3), slice(6, 9)))
-            body = xp.concat([place, rolls * body[..., 3:6], velocity, rolls * body[..., 9:12]], axis=-1)
-        reference = self._follower_mounts
-        if self._follower_sees == "leader":
-            reference = reference - (self._leader_mount[..., None, :] if self._several else self._leader_mount)
-        mount = xp.asarray(reference, dtype=own.dtype)
-        matrix = rotations.matrix_from_quaternion(rotations.quaternion_from_euler(body[..., 3:6]))
-        arm = rotations.rotate(matrix, mount)
-        sweep = rotations.rotate(matrix, rotations.cross(body[..., 9:12], mount))
-        still = xp.zeros_like(goal) if goal_rate is None else goal_rate
+        own = self._without_locked_slots(self.in_body_axes(own))
+        matrix = rotations.matrix_from_quaternion(rotations.quaternion_from_euler(own[..., ATTITUDE]))
+        point = (own[..., 0:3], matrix, own[..., 6:9], own[..., RATES])
+        return self._observation(own, point, self._follower_mounts, goal, goal_rate)
+
+    def _observation(
+        self,
+        own: Float[Array, "... 12"],
+        point: tuple[Array, ...],
+        place: Any,
+        goal: Vector,
+        goal_rate: Vector | None,
+    ) -> Observation:
+        """Observations of followers in states `own`, with the error of O or of the leader's place.
+
+        The error follows from the motion of a `point` of the body: its position, the attitude matrix, its velocity, the
+        body rates. It is at `place` from O, body axes; None: O itself.
+        """
+        xp = goal.__array_namespace__()
+        position, matrix, velocity, rates = point
+        arm = place
         if self._follower_sees == "leader":
             goal = goal + xp.asarray(self._leader_mount, dtype=goal.dtype)
+            lead = self._leader_mount[..., None, :] if self._several else self._leader_mount
+            arm = -lead if place is None else place - lead
         if self._several:
-            goal, still = goal[..., None, :], still[..., None, :]
-        errors = [goal - body[..., 0:3] + arm, still - body[..., 6:9] + sweep]
-        return self._in_mount_frames(xp.concat([body, *map(self._along_free_axes, errors)], axis=-1))
+            goal, goal_rate = (None if part is None else part[..., None, :] for part in (goal, goal_rate))
+        error, error_rate = goal - position, -velocity if goal_rate is None else goal_rate - velocity
+        if arm is not None:
+            arm = xp.asarray(arm, dtype=position.dtype)
+            error = error + rotations.rotate(matrix, arm)
+            error_rate = error_rate + rotations.rotate(matrix, rotations.cross(rates, arm))
+        errors = [self._along_free_axes(error), self._along_free_axes(error_rate)]
+        if self._several:
+            errors = [xp.broadcast_to(part, (*own.shape[:-1], 3)) for part in errors]
+        return self._in_mount_frames(xp.concat([own, *errors], axis=-1))
 
     def _in_mount_frames(self, vectors: Array) -> Array:
         """`vectors` (..., [F,] 3 k) in body axes, in the followers' mount frames."""
@@ -291,12 +301,17 @@ class Controllers:
             return vector
         return vector * vector.__array_namespace__().asarray(self._free, dtype=vector.dtype)
 
+    def _without_locked_slots(self, own: Float[Array, "... 12"]) -> Float[Array, "... 12"]:
+        """Own states without motion along what the stand locks, the tilted mount's way across included."""
+        if self._free is None:
+            return own
+        return own * own.__array_namespace__().asarray([*self._free, *ROLLS] * 2, dtype=own.dtype)
+
     def _without_locked_motion(self, state: Body) -> Body:
         """`state` without motion along what the stand locks."""
         if self._free is None:
             return state
-        xp = state.rates.__array_namespace__()
-        rolls = xp.asarray([1.0, 0.0, 0.0], dtype=state.rates.dtype)
+        rolls = state.rates.__array_namespace__().asarray(ROLLS, dtype=state.rates.dtype)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         quaternion = rotations.quaternion_from_euler(euler * rolls)
         return BodyState(

@@ -297,13 +297,15 @@ def flown_contact_wrenches(
 ) -> tuple[Float[np.ndarray, "T n drones 3"], Float[np.ndarray, "T n drones 3"]]:
     """Contact forces and torques of recorded states (T, n, ...), see `physics.engine.contact_wrenches`.
 
-    `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with other forces than those of rotors
-    in free air, share the closed form.
+    `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with effects of the air, share the
+    closed form. That has no elastic mounts: InputError for flights on them with effects of the air.
     """
-    if physics == "mujoco" and load.external_force is load.rotor_drag is load.floor is load.download is None:
+    if physics == "mujoco" and load.rotor_drag is load.floor is load.download is None:
         from mjxball.physics.mujoco import flown_contact_wrenches as measured
 
         return measured(config, flown, load)
+    if config.plant.mount_frequency:
+        raise InputError("contact forces of drones on elastic mounts are not computed with drag, floor or download")
     constants = plant_parameters(config.plant, config.attitude)
     accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
     wrench = acting_wrench(config.plant, constants, flown.rotor_force, flown, load)

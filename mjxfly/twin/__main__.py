@@ -24,11 +24,19 @@ from mjxball.running import run_command
 from mjxball.terminal import say
 from mjxfly import clock
 from mjxfly.app.host import compile_pair
-from mjxfly.policy_setup import load_policy
+from mjxfly.policy_setup import config_of, is_crazyflie, load_policy
 from mjxfly.process import urgent
 from mjxfly.rehearsal import BEAT, LAST
 from mjxfly.telemetry import Rig
-from mjxfly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
+from mjxfly.twin.conditions import (
+    Injection,
+    LinkFaults,
+    add_twin_options,
+    check_simple,
+    drone_kind,
+    read_fault,
+    surroundings,
+)
 from mjxfly.twin.physics import make_pair
 from mjxfly.twin.server import Twin
 
@@ -53,6 +61,8 @@ def serve(options: argparse.Namespace) -> int:
     clock.slow_down(options.slow)
     policy = load_policy(options.policy) if options.policy else None
     metadata = policy.metadata if policy else None
+    if metadata is None or not is_crazyflie(config_of(metadata)):
+        check_simple(options, options.fault)
     cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
     kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")
     with urgent(), Twin(make_pair(metadata, kind, surroundings(options)), tuple(options.ports), cores) as twin:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -257,6 +258,10 @@ FAULT_KINDS = {
     "weak": FaultKind(BodyFault("gain", 0.9), "its motors give 10 % less"),
 }
 BODY_FAULTS = {kind.what.what for kind in FAULT_KINDS.values() if isinstance(kind.what, BodyFault)}
+POSE_FAULTS = BODY_FAULTS - {"battery", "fade", "gain"}
+# `Surroundings` that the twin of other plants than a Crazyflie pair does not simulate, and body faults that it does.
+COUPLED_ONLY = ("noise", "pose_hz", "gains", "load", "mount", "pose_loss", "positioning")
+SIMPLE_FAULTS = {"battery"}
 
 
 class Injection(NamedTuple):
@@ -276,3 +281,12 @@ def read_fault(text: str) -> Injection:
             f"--fault {text} is no KIND:DRONE@S such as frozen:follower@3; kinds: {', '.join(FAULT_KINDS)}"
         )
     return Injection(FAULT_KINDS[match[1]].what, ("leader", "follower").index(match[2]), float(match[3]), text)
+
+
+def check_simple(options: argparse.Namespace, faults: Iterable[Injection]) -> None:
+    """Raise InputError for flags and faults that the twin of other plants than a Crazyflie pair does not simulate."""
+    flags = [name for name in COUPLED_ONLY if getattr(options, f"twin_{name}", None) is not None]
+    given = [f"--twin-{name.replace('_', '-')}" for name in flags]
+    body = [one for one in faults if isinstance(one.what, BodyFault) and one.what.what not in SIMPLE_FAULTS]
+    for what in (*given, *(f"--fault {one.text}" for one in body)):
+        raise InputError(f"{what} is for policies that were trained on Crazyflies, such as flight")

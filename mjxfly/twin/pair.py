@@ -92,4 +92,4 @@ class Pair(Protocol):
         """Handle a pose that the laptop sent: `position` (3,) [m] and, if known, `quaternion` (4,) (w, x, y, z)."""
 
     def disturb(self, drone: int, what: str, value: float) -> None:
-        """Inject a fault of the body of `drone`, see `BodyFault`."""
+        """Inject a fault of the body of `drone`, see `BodyFault`; InputError for one that is not simulated."""

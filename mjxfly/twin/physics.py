@@ -15,7 +15,7 @@ from mjxball.errors import InputError
 from mjxfly.packets import Setpoint, angles
 from mjxfly.policy_setup import config_of, is_crazyflie
 from mjxfly.setpoints import ForceCurve
-from mjxfly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
+from mjxfly.twin.conditions import COUPLED_ONLY, DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxfly.twin.pair import RUNNING, Pair, PairState, Report, SupervisorOutputs, remembered
 
 CURVE = ForceCurve()
@@ -42,7 +42,11 @@ class SimplePlant:
 
 
 class SimplePair:
-    """Implements `Pair` by one rigid body with second-order attitude dynamics, thrust lag and batteries."""
+    """Implements `Pair` by one rigid body with second-order attitude dynamics, thrust lag and batteries.
+
+    Its motors are those of `SimplePlant`, whatever the `kind`. Raises InputError for `surroundings` that it does not
+    simulate.
+    """
 
     cg_offset = math.nan
     rotor_force = np.zeros((2, 4))  # not modelled
@@ -53,6 +57,9 @@ class SimplePair:
         kind: DroneKind = DELIVERED,
         surroundings: Surroundings = QUIET,
     ):
+        for name in COUPLED_ONLY:
+            if getattr(surroundings, name) != getattr(QUIET, name):
+                raise InputError(f"the twin of other plants than Crazyflies does not simulate surroundings.{name}")
         self.plant, self.kind, self.surroundings = plant, kind, surroundings
         self._mounts = np.array(plant.mounts)
         self._random = np.random.default_rng(surroundings.seed)
@@ -76,9 +83,10 @@ class SimplePair:
         self._poses[drone] = remembered(self._poses[drone], position, quaternion)
 
     def disturb(self, drone: int, what: str, value: float) -> None:
-        """See `Pair.disturb`; only "battery" has an effect."""
-        if what == "battery":
-            self._charge[drone] = value
+        """See `Pair.disturb`; InputError for all but "battery"."""
+        if what != "battery":
+            raise InputError(f"the twin of other plants than Crazyflies simulates the fault 'battery', not {what!r}")
+        self._charge[drone] = value
 
     def advance(self, setpoints: np.ndarray, dt: float, modes: SupervisorOutputs = RUNNING) -> PairState:
         """See `Pair.advance`; a drone whose stabilizer hangs keeps its thrust and levels out."""

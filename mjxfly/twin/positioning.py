@@ -27,6 +27,7 @@ from typing import ClassVar
 import numpy as np
 
 from mjxball.control.rotations import conjugate, matrix_from_quaternion, multiply_quaternions
+from mjxball.errors import InputError
 from mjxfly.twin.conditions import Surroundings
 from mjxfly.twin.estimators import Kalman
 
@@ -57,7 +58,10 @@ class Positioning:
         self._last: np.ndarray | None = None  # (7,) position [m], quaternion
 
     def disturb(self, what: str, value: float) -> None:
-        """Inject "frozen", "frozen z", "lost" (0 or 1), "repeated" (equal poses in a row) or a "jump" of z [m]."""
+        """Inject "frozen", "frozen z", "lost" (0 or 1), "repeated" (equal poses in a row) or a "jump" of z [m].
+
+        Raises InputError for any other.
+        """
         match what:
             case "frozen":
                 self._frozen[:] = bool(value)
@@ -69,6 +73,8 @@ class Positioning:
                 self._repeats = round(value)
             case "jump":
                 self._offset = np.array([0.0, 0.0, value])
+            case _:
+                raise InputError(f"poses have the faults frozen, frozen z, lost, repeated and jump, not {what!r}")
 
     def switch(self, name: str, value: float) -> None:
         """Apply a written parameter of `SWITCHES`; that of another deck has no effect."""

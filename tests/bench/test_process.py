@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY
+from tables import rows
 
 from mjxball.baselines import make_controller
 from mjxball.bench import evaluation, process
@@ -106,6 +107,18 @@ class Busy(Good):
         end = time.process_time() + 0.03
         while time.process_time() < end: pass
         return super().__call__(observation)
+
+class Seldom(Good):
+    share = 1.0
+    def __call__(self, observation):
+        self.calls += 1
+        if self.calls in (5, 150):
+            end = time.process_time() + self.share * (0.01 if self.calls == 150 else 0.1) * len(observation)
+            while time.process_time() < end: pass
+        return super().__call__(observation)
+
+class TooSeldom(Seldom):
+    share = 3.0
 
 class Dies(Good):
     def __call__(self, observation):
@@ -239,6 +252,14 @@ def test_sleeping_is_no_cpu_time_and_printing_does_no_harm(own: Path) -> None:
     for text in ("own:Naps", "own:Prints"):
         with FollowerProcess(text, text) as made:
             assert 0 < made.check_cpu_time(configured) < 0.015
+
+
+@rows("name, slow", [("Seldom", False), ("TooSeldom", True)])
+def test_one_slow_control_step_is_found(own: Path, name: str, slow: bool) -> None:
+    """10 or 30 ms for each flight in step 150 alone; more in step 5, when programs may still compile."""
+    found = flown(f"own:{name}")
+    assert all(("slow" in one.failures) == slow for one in found if not one.metrics.failed)
+    assert any(not one.metrics.failed for one in found)
 
 
 def test_a_follower_that_hides_that_it_needs_the_true_cg_gets_zeros(own: Path) -> None:

@@ -163,7 +163,7 @@ def test_a_flight_with_no_name_for_its_log_gets_one(tmp_path: Path) -> None:
 
 KINDS = {
     "rehearsed": ["--seconds", "2", "--gains", "gains.json", "--loss", "0.1", "--delay", "0.01", "--jitter", "0.005"],
-    "dry": ["--seconds", "1", "--dry-run", "--fault", "weak:leader@0"],  # which waits for a motor to turn
+    "dry": ["--seconds", "1", "--dry-run", "--fault", "sag:leader@0"],  # which waits for a motor to turn
     "interrupted": ["--seconds", "60"],
     "terminated": ["--seconds", "60", "--thrust", "paper", "--hover", "47000"],
 }
@@ -261,7 +261,7 @@ def test_a_dry_run(flights: dict[str, Ended]) -> None:
     flight = flights["dry"]
     assert (flight.code, flight.states()) == (0, NORMAL)
     assert "would have sent" in flight.out
-    assert "weak:leader@0 never came" in flight.out.splitlines()[-1]
+    assert "sag:leader@0 never came" in flight.out.splitlines()[-1]
     assert any(tick["sent"][0][3] > 10000 for tick in flight.ticks("fly"))
     assert max(tick["observation"][2] for tick in flight.ticks("fly")[1:]) < 0.01  # nothing has lifted
 

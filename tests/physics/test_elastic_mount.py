@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import mujoco as mj
 import numpy as np
 import pytest
 from plants import LIGHT_BALL, copying, paper_with, team
 from tables import rows
 
-from mjxball.config import Config, Timing, apply_overrides, preset, with_plant
+from mjxball.assembly import drone_names
+from mjxball.config import Config, Plant, Timing, apply_overrides, preset, with_plant
+from mjxball.control import observation as layout
 from mjxball.control import rotations
 from mjxball.control.axes import inertia_about_o
 from mjxball.errors import InputError
@@ -18,11 +21,21 @@ from mjxball.physics import mjx, mujoco, newton_euler
 from mjxball.physics.autopilot import make_autopilot
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mounts import own_motion, own_quaternion, own_rates
-from mjxball.physics.step import make_numpy_plant_step, make_plant_step, start_state
+from mjxball.physics.step import (
+    acting_wrench,
+    make_accelerations,
+    make_numpy_plant_step,
+    make_plant_step,
+    start_state,
+)
 from mjxball.plant import plant_parameters
 from mjxball.plant.mounts import hinge
-from mjxball.sim.rollout import simulate
+from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.goals import Goal
+from mjxball.sim.rollout import flown_contact_wrenches, simulate
 from mjxball.sim.scenario import Scenario
+from mjxball.sim.sensors import Sample, SensorModel
 
 PAIR = preset("flight")
 TOGETHER, OPPOSED = (1.0, 1.0), (1.0, -1.0)  # how two drones swing
@@ -218,3 +231,80 @@ def test_loops_act_on_the_drones_own_attitude() -> None:
         )
         np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=1e-12)
         assert np.abs(found[:, 1] - found[:, 0]).max() > 1e-3 * found.max()
+
+
+def swinging(config: Config, count: int) -> tuple[PlantState, Load]:
+    """States of a pair or team that turns, on mounts that are turned by up to 0.2 rad and swing."""
+    state, load = at_rest(config, count)
+    random = np.random.default_rng(5)
+    return state._replace(
+        position=random.normal(0.0, 0.5, (count, 3)),
+        quaternion=rotations.quaternion_from_euler(random.normal(0.0, 0.2, (count, 3))),
+        velocity=random.normal(0.0, 0.3, (count, 3)),
+        rates=random.normal(0.0, 1.0, (count, 3)),
+        rotor_force=random.uniform(1.0, 4.0, state.rotor_force.shape),
+        mount_angle=random.normal(0.0, 0.1, state.mount_angle.shape),
+        mount_rate=random.normal(0.0, 2.0, state.mount_rate.shape),
+    ), load
+
+
+@rows("plant", [LIGHT_BALL, team(4, 1, moving_fraction=0.5)])
+def test_a_drone_observes_its_own_attitude(plant: Plant) -> None:
+    """Attitude and rates are those of the drone's body in MuJoCo, and the object's error follows from them."""
+    config = mounted(paper_with(plant), 10.0)
+    state, load = swinging(config, 4)
+    loop = ClosedLoop(config, passive_step(config), SensorModel(present=False))
+    goal, zero = np.array([[0.3, -0.2, 0.4]] * 4), np.zeros(len(plant.directions))
+    seen = loop.start(state, Goal(goal), load, Sample())[1]
+    angles = layout.mount_angles(plant)
+    seen = (seen if angles is None else rotations.turned_about_z(seen, angles)).reshape(4, -1, 18)
+    world = mujoco.MujocoWorld(config.plant, config.attitude)
+    for row in range(4):
+        world.place(state.each(lambda leaf: leaf[row]), plant.object_mass, zero, zero)  # noqa: B023
+        for number, drone in enumerate(plant.followers):
+            body, found = world.model.body(drone_names(plant)[drone]).id, seen[row, number]
+            turn = rotations.matrix_from_quaternion(
+                rotations.quaternion_from_euler(np.array([0, 0, plant.drones[drone].yaw]))
+            )
+            own, velocity = world.data.xmat[body].reshape(3, 3) @ turn.T, np.zeros(6)
+            mj.mj_objectVelocity(world.model, world.data, mj.mjtObj.mjOBJ_BODY, body, velocity, 0)
+            np.testing.assert_allclose(found[0:3], world.data.xpos[body], atol=1e-12)
+            np.testing.assert_allclose(found[3:6], rotations.euler_from_matrix(own), atol=1e-12)
+            np.testing.assert_allclose(found[6:9], velocity[3:], atol=1e-12)
+            np.testing.assert_allclose(found[9:12], own.T @ velocity[:3], atol=1e-12)
+            arm = own @ plant.drones[drone].mount
+            np.testing.assert_allclose(found[12:15], goal[row] - (world.data.xpos[body] - arm), atol=1e-12)
+            np.testing.assert_allclose(found[15:18], np.cross(velocity[:3], arm) - velocity[3:], atol=1e-12)
+        assert np.abs(seen[row, :, 12:15] - (goal - state.position)[row]).max() > 1e-3
+
+
+def test_contact_forces_with_an_external_force() -> None:
+    """F = T R e3 - m (g + a) of every drone, whose centre moves with the carrier; a from the engine, R its own."""
+    config = mounted(paper_with(LIGHT_BALL), 10.0)
+    plant, parameters = config.plant, plant_parameters(config.plant, config.attitude)
+    state, load = swinging(config, 5)
+    force = np.random.default_rng(1).normal(0.0, 2.0, (5, 3))
+    pulled = load._replace(external_force=force)
+    accelerate = make_accelerations(config, mujoco.make_engine(plant, config.attitude))
+    wrench = acting_wrench(plant, parameters, state.rotor_force, state, pulled)
+    linear, angular, *_ = accelerate(state, wrench, load)
+    matrix = rotations.matrix_from_quaternion(state.quaternion)
+    own = rotations.matrix_from_quaternion(own_quaternion(state.quaternion, state.mount_angle, parameters.yaw))
+    w, turning = state.rates[:, None], angular[:, None]
+    lever = np.cross(turning, parameters.mounts) + np.cross(w, np.cross(w, parameters.mounts))
+    moved = linear[:, None] + rotations.rotate(matrix[:, None], lever)
+    weight = np.array([0.0, 0.0, plant.gravity])
+    thrust = state.rotor_force.sum(axis=-1)[..., None] * own[..., 2]
+    expected = rotations.rotate_back(matrix[:, None], thrust - parameters.drone_mass[:, None] * (weight + moved))
+    record = state.each(lambda leaf: leaf[None])
+    found = flown_contact_wrenches(config, record, pulled._replace(external_force=force[None]), "mujoco")[0][0]
+    # 1e-9 of forces of order 10 N
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    without = flown_contact_wrenches(config, record, load, "mujoco")[0][0]
+    assert np.abs(found - without).max() > 0.1
+
+
+def test_a_gusty_flight_is_recorded() -> None:
+    config = mounted(replace(paper_with(LIGHT_BALL), timing=Timing(control_period=0.02, physics_steps=20)), 30.0)
+    scenario = Scenario(seconds=0.3, disturbance=Disturbance(gust=0.5, noise=1.0, seed=1))
+    assert np.isfinite(simulate(config, copying(config), scenario, "mujoco").contact_force).all()

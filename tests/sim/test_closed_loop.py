@@ -120,6 +120,8 @@ class TestStand:
         seen = loop.observe(felt, goal)
         assert not seen[locked].any()
         assert np.abs(np.delete(seen, locked)).min() > 0
+        of_leader = Controllers(apply_overrides(config, {"follower.error": "leader"}))
+        assert not of_leader.observe(felt, goal)[locked].any()
 
     def test_in_free_flight_everything_is_seen(self) -> None:
         felt = body((0.023, -0.023, 0.05), (0.165, 0.1, 0.02), (0.03, 0.01, 0.5), (0.1, 0.05, 0.2))

@@ -129,6 +129,10 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         observation.observe,
         (normal(3), MATRIX, normal(3), normal(3), normal(3), np.array([-0.17, 0, 0])),
     ),
+    "observation.own_state": (
+        observation.own_state,
+        (normal(3), MATRIX, normal(3), normal(3), np.array([-0.17, 0, 0])),
+    ),
     "history.network_input": (HISTORY.network_input, (SEEN, MEMORY)),
     "history.start": (HISTORY.start, (SEEN,)),
     "history.next": (HISTORY.next, (MEMORY, SEEN, ACTION)),
