@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from leaderboard import entries
+from mjxball.baselines import CONTROLLERS
 from mjxball.bench import CONDITIONS
 from mjxball.bench.entry import HEADS, cells
+from mjxball.bench.tracks import TRACKS as BENCH_TRACKS
 from mjxball.running import run_command
 
 REPOSITORY = Path(__file__).parents[1]
@@ -54,29 +57,30 @@ def row(text: str, tracks: Tracks) -> str:
     return " | ".join([text, *(shown(tracks, *column) for column in columns)])
 
 
-def best(found: dict[str, Tracks], track: str, condition: str) -> str:
-    """The learned and the classical followers that succeed most often, and how often; the better kind first."""
-    kinds = []
-    for kind, names in (("learned", TRAINED), ("classical", CLASSICAL)):
-        count = {name: found[name][track][condition]["succeeded"] for name in names if track in found.get(name, {})}
-        if count:
-            most = max(count.values())
-            who = ", ".join(f"`{name}`" for name, succeeded in count.items() if succeeded == most)
-            flights = next(found[name][track][condition]["flights"] for name in count)
-            kinds.append((most, f"{kind} {who} ({100 * most / flights:.0f} %)"))
-    return ", ".join(text for _, text in sorted(kinds, key=lambda one: -one[0])) if len(kinds) == 2 else ""
+def best(found: dict[str, Tracks], names: Iterable[str], track: str, condition: str) -> str:
+    """Those of `names` that succeed most often, and how often [%]; a dash if none flew the track."""
+    count = {name: found[name][track][condition] for name in names if track in found.get(name, {})}
+    most = max((one["succeeded"] for one in count.values()), default=0)
+    who = ", ".join(f"`{name}`" for name, one in count.items() if one["succeeded"] == most)
+    return f"{who} {100 * most / next(iter(count.values()))['flights']:.0f}" if count else "-"
+
+
+def bests(found: dict[str, Tracks]) -> list[str]:
+    """A table of the best learned and the best classical follower on each track that was flown."""
+    learned = sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz"))
+    lines = ["best [%]|calm: learned|classical|world: learned|classical", "|".join(["---"] * 5)]
+    for name, track in BENCH_TRACKS.items():
+        if any(name in tracks for tracks in found.values()):
+            parts = [best(found, kind, name, one) for one in CONDITIONS for kind in (learned, CONTROLLERS)]
+            lines.append("|".join([track.title, *parts]))
+    return [*lines, ""]
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
     """What the entries say, true whatever their values are."""
-    said = []
-    for track, title in TRACKS.items():
-        order = {condition: best(found, track, condition) for condition in CONDITIONS}
-        if all(order.values()):
-            said.append(f"Best, {title}: calm {order['calm']}; world {order['world']}.")
     with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
         parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
-    said.append(f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1))
+    said = [f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1)]
     if "pair" in found.get(MINUTE, {}):
         said.append(f"The training below succeeds in {shown(found[MINUTE], 'pair', 'success %')} %.")
     return said
@@ -87,7 +91,7 @@ def block() -> str:
     found = {entry["follower"]: entry["tracks"] for entry in entries()}
     rows = [row(text, found[name]) for name, text in (CLASSICAL | TRAINED).items() if name in found]
     table = [" | ".join(COLUMNS), "|".join(["---"] * len(COLUMNS)), *rows]
-    return "\n".join(["", *table, "", *sentences(found), "", ""])
+    return "\n".join(["", *table, "", *bests(found), *sentences(found), "", ""])
 
 
 def main() -> int:

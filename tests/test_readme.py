@@ -71,17 +71,16 @@ def test_the_block_has_a_row_for_every_entry_and_names_the_best(entered: Any) ->
     assert [row[0].strip("*`").partition("`")[0] for row in rows] == ["follower", "copy", "lqg", "balance"]
     assert rows[2][1:] == ["83/84", "83/83", "1.10/1.10", "8.0/18.0", "2.0/2.0"]
     assert rows[1][2] == "-"  # a track that was not flown
-    calm, world = "learned `balance` (83 %), classical", "classical `lqg` (84 %), learned `balance` (83 %)."
-    assert f"Best, mass known: calm {calm} `copy`, `lqg` (83 %); world {world}" in text
-    assert "Best, mass unknown" not in text  # nothing learned has flown it
-    assert len(text.splitlines()) == len(empty.splitlines()) + 4
-    assert "mass known:" not in empty
+    assert "\npair, mass known|`balance` 83|`copy`, `lqg` 83|`balance` 83|`lqg` 84\n" in text
+    assert "\npair, mass unknown|-|`lqg` 83|-|`lqg` 83\n" in text  # nothing learned has flown it
+    assert len(text.splitlines()) == len(empty.splitlines()) + 5
+    assert "mass known|" not in empty
 
 
 def test_the_block_names_all_that_are_best(entered: Any) -> None:
     usual = {"pair": {"calm": results(), "world": results(late_error_90=0.018)}}
     text = entered(**dict.fromkeys(("pid", "lqg", "sac", "transport-sac"), usual))
-    assert "world learned `sac` (83 %), classical `pid`, `lqg` (83 %)." in text
+    assert "\npair, mass known|`sac` 83|`pid`, `lqg` 83|" in text
     assert "The training below succeeds in 83/83 %." in text
 
 
