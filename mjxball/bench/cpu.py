@@ -18,15 +18,19 @@ def cpu_time(pid: int) -> float:
 
     On Linux with that of the processes which it has started and waited for.
     """
+    fields = _stat(Path(f"/proc/{pid}/stat")) if LINUX else None
+    return own_time(pid) + (0.0 if fields is None else sum(map(int, fields[13:15])) / os.sysconf("SC_CLK_TCK"))
+
+
+def own_time(pid: int) -> float:
+    """`cpu_time` without that of other processes, which on Linux takes a tenth of the time to read."""
     if not LINUX:
         found = _ps("-p", str(pid), "-o", "cputime=")
         return seconds(found[0]) if found else 0.0
-    fields = _stat(Path(f"/proc/{pid}/stat"))
     try:
-        own = time.clock_gettime((~pid << 3) | 2)  # the clock that clock_getcpuclockid(3) returns
+        return time.clock_gettime((~pid << 3) | 2)  # the clock that clock_getcpuclockid(3) returns
     except OSError:
         return 0.0
-    return own if fields is None else own + sum(map(int, fields[13:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def others_of_group(pid: int) -> list[int]:

@@ -68,8 +68,10 @@ class FollowerProcess:
         )
         os.close(receive)
         os.close(send)
-        for pipe in (self._send, self._receive):
+        self._selectors = {self._send: selectors.DefaultSelector(), self._receive: selectors.DefaultSelector()}
+        for pipe, event in ((self._send, selectors.EVENT_WRITE), (self._receive, selectors.EVENT_READ)):
             os.set_blocking(pipe, False)
+            self._selectors[pipe].register(pipe, event)
         self._printed: deque[str] = deque(maxlen=OUTPUT_LINES)
         assert self._process.stdout is not None
         threading.Thread(target=_drain, args=(self._process.stdout, self._printed), daemon=True).start()
@@ -87,7 +89,8 @@ class FollowerProcess:
         with contextlib.suppress(ProcessLookupError, PermissionError):  # it has ended; macOS: it is a zombie
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        for pipe in (self._send, self._receive):
+        for pipe, selector in self._selectors.items():
+            selector.close()
             with contextlib.suppress(OSError):
                 os.close(pipe)
 
@@ -95,6 +98,11 @@ class FollowerProcess:
     def cpu_time(self) -> float:
         """CPU time of the process so far [s], as the operating system counts it."""
         return cpu.cpu_time(self._process.pid)
+
+    @property
+    def own_time(self) -> float:
+        """`cpu_time` without that of processes which it has started [s]."""
+        return cpu.own_time(self._process.pid)
 
     def follower(self, config: Config) -> RemoteFollower:
         """The follower made for the nominal plant of `config`; RefusalError if it does not fly that plant."""
@@ -149,7 +157,7 @@ class FollowerProcess:
     def _write(self, content: bytes, until: float) -> None:
         view = memoryview(content)
         while view:
-            self._wait(self._send, selectors.EVENT_WRITE, until)
+            self._wait(self._send, until)
             try:
                 view = view[os.write(self._send, view) :]
             except OSError:
@@ -158,22 +166,20 @@ class FollowerProcess:
     def _read(self, count: int, until: float) -> bytes:
         found = bytearray()
         while len(found) < count:
-            self._wait(self._receive, selectors.EVENT_READ, until)
+            self._wait(self._receive, until)
             part = os.read(self._receive, min(count - len(found), 2**16))
             if not part:
                 raise self._ended()
             found += part
         return bytes(found)
 
-    def _wait(self, pipe: int, event: int, until: float) -> None:
-        with selectors.DefaultSelector() as selector:
-            selector.register(pipe, event)
-            # An end of the pipe may be in a process that the follower has started, when its own has ended.
-            while not selector.select(max(0.0, min(1.0, until - time.monotonic()))):
-                if time.monotonic() >= until:
-                    raise InputError(f"follower {self.name} did not answer in time")
-                if self._process.poll() is not None:
-                    raise self._ended()
+    def _wait(self, pipe: int, until: float) -> None:
+        # An end of the pipe may be in a process that the follower has started, when its own has ended.
+        while not self._selectors[pipe].select(max(0.0, min(1.0, until - time.monotonic()))):
+            if time.monotonic() >= until:
+                raise InputError(f"follower {self.name} did not answer in time")
+            if self._process.poll() is not None:
+                raise self._ended()
 
     def _ended(self) -> InputError:
         """The error after the process has ended or has closed its pipe."""
@@ -208,7 +214,7 @@ class RemoteFollower:
         """See `Follower.__call__`; InputError if it sends no command."""
         sent = self._number + frames.packed(observation)
         if self._calls % cpu.CALLS == 0:
-            self._begun = self._process.cpu_time, self._process.answered
+            self._begun = self._process.own_time, self._process.answered
         content = self._process.ask(frames.OBSERVATION, sent, frames.COMMAND, len(observation))
         self._count_time()
         command = checked_command(self.name, frames.unpacked(content), observation)
@@ -222,7 +228,7 @@ class RemoteFollower:
         self._calls += 1
         if self._calls % cpu.CALLS == 0 and self._calls > WARM_UP:
             begun, answered = self._begun
-            taken = (self._process.cpu_time - begun) / (self._process.answered - answered)
+            taken = (self._process.own_time - begun) / (self._process.answered - answered)
             self.slowest = max(self.slowest, taken)
 
 
