@@ -9,8 +9,16 @@ its programs on the CPU, the sets shared out among processes. What is made small
 after which |e_o| stays within a bound, over that of `oracle` and at most four, plus the share of flights without
 success: later than the benchmark's deadline, or a rotor at its limit for more than 5 % of the time. Bounds and
 deadlines are those of the benchmark, whose draw 4711 flies here and in no table. Of an oracle it is the mean of that
-time in seconds, for these bounds and for three tenths of them. Every set is written to the log, one line of JSON each:
-its tuning, its cost, and the cost's parts.
+time in seconds, for these bounds and for three tenths of them. The log has a line of JSON for the best set of a round: its
+tuning, its cost, and the cost's parts. Those kept in `benchmarks/results/` have every fifth line and the best.
+
+Shipped tunings, besides `--condition`:
+
+    lqg, pid, observer          --track pair --flights 72 --sets 48 --rounds 80 (pid, observer: 40)
+    lqg-team                    --track team rigs --plants 5 --flights 12 --sets 48 --rounds 25
+    crazyflie-lqg               --track crazyflie --flights 48 --sets 48 --rounds 40 (for both conditions: 80)
+    mpc                         --track pair --flights 12 --sets 32 --rounds 32
+    mpc-team                    --track team --plants 2 --flights 4 --sets 26 --rounds 19
 """
 
 from __future__ import annotations
@@ -39,6 +47,7 @@ from mjxball.baselines.observer import Observer
 from mjxball.baselines.pid import Pid
 from mjxball.bench import CONDITIONS
 from mjxball.bench.draw import sample_group, with_perfect_sensors
+from mjxball.bench.success import MAX_ROTOR_SHARE
 from mjxball.bench.tracks import TRACKS, PlantFlights
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Controller
@@ -54,7 +63,6 @@ from mjxball.xla import enable_compilation_cache
 
 DRAW, SECONDS = 4711, 15.0  # of flights that no table reports
 STRICT = 0.3  # share of the bounds within which an oracle is asked to stay, too
-LIMITED = 0.05  # largest share of time with a rotor at its limit, of a success
 ORACLES = ("oracle", "crazyflie-oracle")  # of ideal attitude loops, of Crazyflies
 WORST = 4.0  # times that of `oracle` a flight counts at most
 SETS, ROUNDS, WIDTH, FLIGHTS = 24, 40, 0.25, 24
@@ -242,7 +250,7 @@ class Search:
         self._parts = [part.of_oracle(share) for part in parts for share in (1.0, STRICT)] if self._absolute else parts
         self._threads = ThreadPoolExecutor(len(self._parts))  # which compile and fly all plants at once
         self._flown = [Flown(name, part) if self.tuned.arrays else None for part in self._parts]
-        self._begun = time.perf_counter()
+        self._sets, self._begun = 0, time.perf_counter()
 
     def __call__(self, sets: np.ndarray) -> np.ndarray:
         """(S,) costs of `sets` (S, k), values of what is `searched`."""
@@ -257,11 +265,12 @@ class Search:
             name: {key: values[:, conditions == name] for key, values in of_flights.items()}
             for name in dict.fromkeys(conditions)
         }
-        for number, tuning in enumerate(tunings):
-            record = {name: summary({k: v[number] for k, v in own.items()}) for name, own in parts.items()}
-            cost = round(float(of_flights["cost"][number].mean()), 4)
-            self._write({"cost": cost, "tuning": tuning._asdict(), **record})
-        return np.asarray(of_flights["cost"].mean(axis=1))
+        costs = np.asarray(of_flights["cost"].mean(axis=1))
+        self._sets, best = self._sets + len(sets), int(costs.argmin())
+        tuning = {name: float(f"{value:.4g}") for name, value in tunings[best]._asdict().items()}
+        found = {name: summary({k: v[best] for k, v in own.items()}) for name, own in parts.items()}
+        self._write({"cost": round(float(costs[best]), 4), "tuning": tuning, **found, "sets": self._sets})
+        return costs
 
     def _write(self, record: dict[str, Any]) -> None:
         if self._log:
@@ -275,7 +284,7 @@ def numbers_of(measured: Measured, part: Part, absolute: bool) -> dict[str, np.n
 
     Costs are of the time in seconds if `absolute`, else of that over the oracle's.
     """
-    late, limited = np.minimum(measured.time, SECONDS), measured.limited > LIMITED
+    late, limited = np.minimum(measured.time, SECONDS), measured.limited > MAX_ROTOR_SHARE
     if absolute:
         succeeds, ratio = np.isfinite(measured.time) & ~limited, late
     else:

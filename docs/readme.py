@@ -34,6 +34,7 @@ CLASSICAL = {
     "lqg": "`lqg`",
 }
 TRAINED = {"sac": "**`sac`**: learned by SAC", "balance": "**`balance`**: learned by gradients"}
+LEARNED = sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz"))
 MINUTE = "transport-sac"  # what README trains
 COLUMNS = (
     *(
@@ -73,20 +74,33 @@ def best(found: dict[str, Tracks], names: Iterable[str], track: str, condition: 
 
 def bests(found: dict[str, Tracks]) -> list[str]:
     """A table of the best learned and the best classical follower on each track that was flown."""
-    learned = sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz"))
     lines = ["best [%]|calm: learned|classical|world: learned|classical", "|".join(["---"] * 5)]
     for name, track in BENCH_TRACKS.items():
         if any(name in tracks for tracks in found.values()):
-            parts = [best(found, kind, name, one) for one in CONDITIONS for kind in (learned, CONTROLLERS)]
+            parts = [best(found, kind, name, one) for one in CONDITIONS for kind in (LEARNED, CONTROLLERS)]
             lines.append("|".join([track.title, *parts]))
     return [*lines, ""]
+
+
+def leads(found: dict[str, Tracks]) -> list[str]:
+    """A sentence on where classical followers succeed most often, if both kinds have flown."""
+    found = {name: tracks for name, tracks in found.items() if name in CONTROLLERS or name in LEARNED}
+    wins = []
+    for track in BENCH_TRACKS:
+        flown = {name: tracks[track] for name, tracks in found.items() if track in tracks}
+        for one in CONDITIONS if len({name in CONTROLLERS for name in flown}) == 2 else ():
+            most = {
+                kind: max(flown[n][one]["succeeded"] for n in flown if (n in CONTROLLERS) == kind) for kind in (0, 1)
+            }
+            wins.append(most[True] > most[False])
+    return [f"Classical followers lead in {sum(wins)} of {len(wins)} cells."] if wins else []
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
     """What the entries say, true whatever their values are."""
     with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
         parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
-    said = [f"`balance` has {parameters:,} weights, the same for known and unknown masses.".replace(",", " ", 1)]
+    said = [f"`balance` has {parameters:,} weights.".replace(",", " ", 1), *leads(found)]
     if "pair" in found.get(MINUTE, {}):
         said.append(f"The training below succeeds in {shown(found[MINUTE], 'pair', 'success %')} %.")
     return said

@@ -243,14 +243,14 @@ class Lqg:
 
 
 class CalmLqg(Lqg):
-    """`lqg` for flights that are known to be without noise and delay."""
+    """`lqg` for flights that are known to be calm: constant errors of the sensors alone."""
 
     name = "lqg-calm"
     tuning, team_tuning = CALM, TEAM_CALM
 
 
 class WorldLqg(Lqg):
-    """`lqg` for flights that are known to be with noise and delay."""
+    """`lqg` for flights that are known to be in the world: noise, delay, wind, errors of the plant."""
 
     name = "lqg-world"
     tuning, team_tuning = WORLD, TEAM_WORLD
