@@ -9,8 +9,8 @@ its programs on the CPU, the sets shared out among processes. What is made small
 after which |e_o| stays within a bound, over that of `oracle` and at most four, plus the share of flights without
 success: later than the benchmark's deadline, or a rotor at its limit for more than 5 % of the time. Bounds and
 deadlines are those of the benchmark, whose draw 4711 flies here and in no table. Of an oracle it is the mean of that
-time in seconds, for these bounds and for three tenths of them. The log has a line of JSON for the best set of a round: its
-tuning, its cost, and the cost's parts. Those kept in `benchmarks/results/` have every fifth line and the best.
+time in seconds, for these bounds and for three tenths of them. The log has a line of JSON for the best set of a round:
+its tuning, its cost, and the cost's parts. Those kept in `benchmarks/results/` have every fifth line and the best.
 
 Shipped tunings, besides `--condition`:
 
