@@ -73,7 +73,8 @@ def test_the_block_has_a_row_for_every_entry_and_names_the_best(entered: Any) ->
     assert rows[1][2] == "-"  # a track that was not flown
     assert "\npair, mass known|`balance` 83|`copy`, `lqg` 83|`balance` 83|`lqg` 84\n" in text
     assert "\npair, mass unknown|-|`lqg` 83|-|`lqg` 83\n" in text  # nothing learned has flown it
-    assert len(text.splitlines()) == len(empty.splitlines()) + 5
+    assert "\nClassical followers lead in 1 of 2 cells.\n" in text
+    assert len(text.splitlines()) == len(empty.splitlines()) + 6
     assert "mass known|" not in empty
 
 
