@@ -64,43 +64,33 @@ def row(text: str, tracks: Tracks) -> str:
     return " | ".join([text, *(shown(tracks, *column) for column in columns)])
 
 
-def best(found: dict[str, Tracks], names: Iterable[str], track: str, condition: str) -> str:
-    """Those of `names` that succeed most often, and how often [%]; a dash if none flew the track."""
-    count = {name: found[name][track][condition] for name in names if track in found.get(name, {})}
-    most = max((one["succeeded"] for one in count.values()), default=0)
-    who = ", ".join(f"`{name}`" for name, one in count.items() if one["succeeded"] == most)
-    return f"{who} {100 * most / next(iter(count.values()))['flights']:.0f}" if count else "-"
+def best(found: dict[str, Tracks], names: Iterable[str], track: str, condition: str) -> tuple[float, str]:
+    """How often those of `names` succeed that do most often [%], and who they are; (-1, a dash) if none flew."""
+    flown = {name: found[name][track][condition] for name in names if track in found.get(name, {})}
+    share = {name: 100 * one["succeeded"] / one["flights"] for name, one in flown.items()}
+    most = max(share.values(), default=-1.0)
+    who = ", ".join(f"`{name}`" for name, value in share.items() if value == most)
+    return most, f"{who} {most:.0f}" if share else "-"
 
 
 def bests(found: dict[str, Tracks]) -> list[str]:
-    """A table of the best learned and the best classical follower on each track that was flown."""
-    lines = ["best [%]|calm: learned|classical|world: learned|classical", "|".join(["---"] * 5)]
+    """A table of the best learned and the best classical follower on each track that was flown, and who leads."""
+    lines, wins = ["best [%]|calm: learned|classical|world: learned|classical", "|".join(["---"] * 5)], []
     for name, track in BENCH_TRACKS.items():
-        if any(name in tracks for tracks in found.values()):
-            parts = [best(found, kind, name, one) for one in CONDITIONS for kind in (LEARNED, CONTROLLERS)]
-            lines.append("|".join([track.title, *parts]))
-    return [*lines, ""]
-
-
-def leads(found: dict[str, Tracks]) -> list[str]:
-    """A sentence on where classical followers succeed most often, if both kinds have flown."""
-    found = {name: tracks for name, tracks in found.items() if name in CONTROLLERS or name in LEARNED}
-    wins = []
-    for track in BENCH_TRACKS:
-        flown = {name: tracks[track] for name, tracks in found.items() if track in tracks}
-        for one in CONDITIONS if len({name in CONTROLLERS for name in flown}) == 2 else ():
-            most = {
-                kind: max(flown[n][one]["succeeded"] for n in flown if (n in CONTROLLERS) == kind) for kind in (0, 1)
-            }
-            wins.append(most[True] > most[False])
-    return [f"Classical followers lead in {sum(wins)} of {len(wins)} cells."] if wins else []
+        cells = [[best(found, kind, name, one) for kind in (LEARNED, CONTROLLERS)] for one in CONDITIONS]
+        shares = [[share for share, _ in both] for both in cells]
+        if max(map(max, shares)) >= 0:
+            lines.append("|".join([track.title, *(text for both in cells for _, text in both)]))
+        wins += [classical > learned for learned, classical in shares if min(learned, classical) >= 0]
+    said = [f"Classical followers lead in {sum(wins)} of {len(wins)} cells."] if wins else []
+    return [*lines, "", *said]
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
     """What the entries say, true whatever their values are."""
     with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
         parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
-    said = [f"`balance` has {parameters:,} weights.".replace(",", " ", 1), *leads(found)]
+    said = [f"`balance` has {parameters:,} weights.".replace(",", " ", 1)]
     if "pair" in found.get(MINUTE, {}):
         said.append(f"The training below succeeds in {shown(found[MINUTE], 'pair', 'success %')} %.")
     return said

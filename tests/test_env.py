@@ -109,6 +109,24 @@ def test_unknown_mass_is_not_believed(transport):
     assert float(load.object_mass) != float(load.believed_mass)
 
 
+def test_rotors_near_a_limit_cost_by_what_each_drone_can_give(transport):
+    """The largest force of every rotor is that of the plant times the thrust of its drone."""
+    silent = dict.fromkeys(("error", "velocity", "rates", "effort", "smoothness", "termination"), 0.0)
+    settings = with_settings(
+        transport, reward={**silent, "rotor_limits": 2.0}, scenario={"thrust_scale": (0.9, 1.1), "trim_margin": 0.0}
+    )
+    env = TransportEnv(settings, "newton-euler")
+    state, step = jax.jit(env.reset)(jax.random.key(8)), jax.jit(env.step)
+    for _ in range(8):
+        state = step(state, jnp.ones(3))
+    world = state.pipeline_state
+    most = np.array(settings.plant.of_drones("rotor_force_max")) * np.array(world.load.thrust_scale)
+    share = np.array(world.plant.rotor_force) / most[:, None]
+    near = np.maximum(np.abs(share - 0.5) - 0.4, 0.0)
+    assert near.max() > 0
+    assert float(state.reward) == pytest.approx(-2.0 * (near**2).sum(), rel=1e-4)  # float32
+
+
 def near_the_limit(state: Any, config: Config, left: int) -> Any:
     """`state` with `left` control steps to go."""
     steps = state.pipeline_state.steps

@@ -253,14 +253,14 @@ class CrazyflieLqg:
 
 
 class CalmCrazyflieLqg(CrazyflieLqg):
-    """`lqg` for flights that are known to be without noise and delay."""
+    """`lqg` for flights that are known to be calm: constant errors of the sensors alone."""
 
     name = "lqg-calm"
     tuning = CALM
 
 
 class WorldCrazyflieLqg(CrazyflieLqg):
-    """`lqg` for flights that are known to be with noise and delay."""
+    """`lqg` for flights that are known to be in the world: noise, delay, wind, errors of the plant."""
 
     name = "lqg-world"
     tuning = WORLD

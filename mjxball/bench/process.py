@@ -195,7 +195,8 @@ class RemoteFollower:
     """A `mjxball.control.followers.Follower` that asks its process. Commands are checked, then clipped as everybody's.
 
     Set `believed_mass` (n,) [kg] of n flights before a reset. `slowest` is the largest CPU time of a call over the
-    number of flights that it answers [s], without the first `WARM_UP` calls after a reset, in which programs compile.
+    number of flights that it answers [s], without the first `WARM_UP` calls after a reset, in which programs compile,
+    and without processes that it starts and waits for, which count in the mean of all calls.
     Where the operating system counts coarsely, it is that of `cpu.CALLS` calls and of what the process does meanwhile.
     """
 
