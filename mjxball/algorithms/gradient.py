@@ -22,6 +22,7 @@ from mjxball.scalar_form import scalar_form
 SMALL_RESPONSE = 1e-3  # response to a unit impulse, in deviations of observations and in actions, that is negligible
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
 IMPULSE_RESPONSE_FROM = 0.75  # share of the gradient steps after which the impulse response counts
+FINE_ESTIMATE = 20.0  # an estimated number of deviation 1 is also estimated as the tanh of this multiple
 LEAST_DEVIATION = 0.02  # of an observation, so that one which hardly moves in the first window is not amplified
 
 
@@ -39,10 +40,13 @@ def _unbatched_rule(count: int, batched: Any, value: Array) -> tuple[Array, bool
     return (value[0] if batched[0] else value), False
 
 
+ESTIMATE = "estimate"  # layer that estimates what critics alone observe from a GRU's state
+
+
 class GradientState(NamedTuple):
     """State of `FirstOrderGradient`."""
 
-    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`PolicyNetwork`)
+    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, "gru" (`PolicyNetwork`), and ESTIMATE
     adam: Any
     slope: Any  # gradient of the last window's loss, a pytree like `layers`
     loss: Array  # () minus the mean reward of the last window
@@ -90,12 +94,23 @@ class FirstOrderGradient:
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
         weight: Any = settings.impulse_response  # a traced array in a sweep
         self._responds = not (isinstance(weight, (int, float)) and weight == 0)
+        weight = settings.estimation
+        self._estimated = self._sizes[0] - self._slots.stop  # numbers
+        self._estimates = not (isinstance(weight, (int, float)) and weight == 0)
+        if self._estimates and not (self._units and self._estimated):
+            raise InputError(
+                "gradient.estimation needs a recurrent network and something to estimate: "
+                "--follower.recurrent_units 48 --follower.privileged_critic true"
+            )
         self._responds_from = round(IMPULSE_RESPONSE_FROM * settings.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
         """Initial state. The first policy outputs actions close to 0."""
         inputs = self._slots.start if self._units else self._sizes[0]
         layers = fresh_layers(key, inputs, self._units, self._sizes[1:])
+        if self._estimates:
+            shape = self._units, 2 * self._estimated
+            layers[ESTIMATE] = {"kernel": jnp.zeros(shape), "bias": jnp.zeros(shape[1])}
         zero, zeros = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
         return GradientState(layers, self._adam.init(layers), slope, zero, zeros, zeros, zero, jnp.zeros((), jnp.int32))
@@ -128,6 +143,8 @@ class FirstOrderGradient:
         if policy.gru is not None:
             kernel, recurrent, bias = policy.gru
             layers["gru"] = {"kernel": np.asarray(kernel * factor, np.float32), "recurrent": recurrent, "bias": bias}
+        if ESTIMATE in state.layers:
+            layers[ESTIMATE] = state.layers[ESTIMATE]
         means, squares = np.zeros(self._sizes[0], np.float32), np.ones(self._sizes[0], np.float32)
         means[:seen], squares[:seen] = mean, mean**2 + deviation**2
         return state._replace(layers=layers, mean=means, square=squares, seen=np.ones((), np.float32))
@@ -179,7 +196,10 @@ class FirstOrderGradient:
             seen, lasting = envs.states.obs, 0.0
             if response:
                 response, lasting = advance(envs, response, impulse)
-            envs, after = self._environments.step(envs, policy(seen), None)
+            answer = policy(seen)
+            if self._estimates:
+                lasting = lasting + self._estimation_cost(layers, policy, seen, answer[..., self._actions :])
+            envs, after = self._environments.step(envs, answer, None)
             impulse = jax.tree.map(jnp.zeros_like, impulse)  # lasts one step
             return (_forget(envs), response, impulse), (after.reward - lasting, jax.lax.stop_gradient(seen))
 
@@ -188,6 +208,14 @@ class FirstOrderGradient:
         start: Any = envs, response, impulse
         (envs, *_), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
+
+    def _estimation_cost(self, layers: Any, policy: PolicyNetwork, seen: Array, hidden: Array) -> Array:
+        """(envs,) cost of how far the estimates from a GRU's state `hidden` are from what critics alone observe."""
+        known, estimate = slice(self._slots.stop, None), layers[ESTIMATE]
+        true = jax.lax.stop_gradient((seen[..., known] - policy.mean[known]) / policy.deviation[known])
+        true = jnp.concatenate([true, jnp.tanh(FINE_ESTIMATE * true)], axis=-1)
+        wrong = hidden @ estimate["kernel"] + estimate["bias"] - true
+        return self._config.estimation * (wrong**2).mean(axis=-1)
 
     def _advance_response(
         self, policy: PolicyNetwork, envs: Any, response: list[Array], impulse: Array
@@ -257,7 +285,8 @@ class FirstOrderGradient:
         xp = state.mean.__array_namespace__()  # NumPy when a policy file is written, so that nothing is compiled
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
-        return PolicyNetwork(state.layers, state.mean, deviation, self._mask)
+        layers = {name: layer for name, layer in state.layers.items() if name != ESTIMATE}
+        return PolicyNetwork(layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
         """No array of the state is cut by environments."""

@@ -97,4 +97,11 @@ class Gradient:
         low=0,
         high=1e6,
     )
+    estimation: float = setting(
+        0.0,
+        "weight of the squared error of a linear estimate, from a recurrent network's state, of what critics alone "
+        "observe (follower.privileged_critic), each over its deviation; trains the memory, and is not exported",
+        low=0,
+        high=1e6,
+    )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)

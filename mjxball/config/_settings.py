@@ -130,6 +130,7 @@ class Follower:
         low=0.001,
         high=1e6,
     )
+    stale: bool = setting(False, "the network also observes whether its measurement is still the last one")
     recurrent_units: int = setting(0, "units of the network's GRU; 0: none", low=0, high=512)
     privileged_critic: bool = setting(
         False, "in training, critics also observe the CG, the true mass and the disturbances"

@@ -50,7 +50,7 @@ class NetworkInterface(NamedTuple):
     @property
     def input_size(self) -> int:
         """Size n of `network_input` without a GRU's state."""
-        return OBSERVATION_SIZE + self.history.size + (SATURATED if self.units else 0) + self._geometry_size
+        return OBSERVATION_SIZE + self.history.input_size + (SATURATED if self.units else 0) + self._geometry_size
 
     def mask(self, ignore_position: bool) -> list[float]:
         """1 for components of `network_input` that the network uses, 0 for absolute positions if it ignores them."""

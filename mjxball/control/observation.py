@@ -40,6 +40,8 @@ OBSERVATION_SIZE = len(OBSERVATION)
 ACTION_SIZE = len(ACTION)
 ERROR = slice(12, 15)
 ERROR_RATE = slice(15, 18)
+OWN_STATE = 12  # numbers of the follower's own measured state, which an observation begins with
+STALE = 0.05  # input of a network where a measurement repeats the last; small, so that rare ones are not amplified
 
 
 def own_state(position: Array, matrix: Array, velocity: Array, rates: Array, mount: Array) -> Array:
@@ -109,16 +111,27 @@ class ObservationHistory(NamedTuple):
 
     The memory (..., m) holds, in this order: for each time constant of `filters` an exponential average of the
     observations (18) and one of the network's actions (3), which is what a linear observer of disturbances needs of
-    the past; the last action (3) if `previous_action`.
+    the past; the last action (3) if `previous_action`; the last own state (12) if `stale`.
     """
 
     previous_action: bool = False
     filters: tuple[float, ...] = ()  # time constants [s]
     period: float = 0.02  # between two observations [s]
+    stale: bool = False  # whether the network's input says that no new measurement has arrived
 
     @property
     def size(self) -> int:
-        """Length m of the memory, and what `network_input` is longer than an observation."""
+        """Length m of the memory."""
+        return self._past + OWN_STATE * self.stale
+
+    @property
+    def input_size(self) -> int:
+        """What `network_input` is longer than an observation."""
+        return self._past + self.stale
+
+    @property
+    def _past(self) -> int:
+        """Length of the memory of averages and the last action."""
         averages = len(self.filters) * (OBSERVATION_SIZE + ACTION_SIZE)
         return averages + (ACTION_SIZE if self.previous_action else 0)
 
@@ -127,6 +140,8 @@ class ObservationHistory(NamedTuple):
         xp = observation.__array_namespace__()
         still = xp.zeros_like(observation[..., :ACTION_SIZE])
         parts = [observation, still] * len(self.filters) + [still] * self.previous_action
+        # Not equal to the first measurement, which is new.
+        parts += [observation[..., :OWN_STATE] + 1.0] * self.stale
         return xp.concat(parts, axis=-1) if parts else observation[..., :0]
 
     def next(self, memory: Array, observation: Array, scaled_action: Array) -> Array:
@@ -138,27 +153,31 @@ class ObservationHistory(NamedTuple):
         for average, tau in zip(self._averages(memory), self.filters, strict=True):
             new = xp.concat([observation, scaled_action], axis=-1)
             parts.append(average - math.expm1(-self.period / tau) * (new - average))
-        parts += [scaled_action] * self.previous_action
+        parts += [scaled_action] * self.previous_action + [observation[..., :OWN_STATE]] * self.stale
         return xp.concat(parts, axis=-1)
 
     def network_input(self, observation: Array, memory: Array) -> Array:
-        """Input of the network (..., 18 + m): the observation, then the memory, averages minus the observation.
+        """Input of the network (..., 18 + `input_size`): the observation, averages minus it, the last action, `STALE`.
 
         The difference to an average is a filtered derivative; normalised on its own it keeps its small numbers.
         """
         xp = observation.__array_namespace__()
-        if not self.filters:
-            return xp.concat([observation, memory], axis=-1)
         parts = [observation]
         for average in self._averages(memory):
             parts += [average[..., :OBSERVATION_SIZE] - observation, average[..., OBSERVATION_SIZE:]]
-        return xp.concat([*parts, memory[..., self.size - ACTION_SIZE * self.previous_action :]], axis=-1)
+        parts.append(memory[..., self._past - ACTION_SIZE * self.previous_action : self._past])
+        if self.stale:
+            repeats = xp.all(observation[..., :OWN_STATE] == memory[..., self._past :], axis=-1, keepdims=True)
+            parts.append(
+                xp.where(repeats, xp.asarray(STALE, dtype=observation.dtype), xp.zeros_like(parts[0][..., :1]))
+            )
+        return xp.concat(parts, axis=-1)
 
     def mask(self, ignore_position: bool) -> list[float]:
         """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
         shown = [0.0 if ignore_position else 1.0] * 3 + [1.0] * (OBSERVATION_SIZE - 3)
         # How an absolute position differs from its average does not depend on where that is.
-        return shown + [1.0] * self.size
+        return shown + [1.0] * self.input_size
 
     def slowest_action(self, memory: Array) -> Array:
         """(..., 3) the network's own action in [-1, 1], averaged over the longest of `filters`."""
@@ -173,4 +192,4 @@ class ObservationHistory(NamedTuple):
 def observation_history(config: Config) -> ObservationHistory:
     """That of the follower of `config`."""
     follower, period = config.follower, config.timing.control_period
-    return ObservationHistory(follower.previous_action, follower.observation_averages, period)
+    return ObservationHistory(follower.previous_action, follower.observation_averages, period, follower.stale)

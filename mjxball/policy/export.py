@@ -42,6 +42,7 @@ def policy_file(
         "history": 1,  # number of observations; 0.1.0 and earlier allowed more
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
+        **({"stale": True} if follower.stale else {}),
         **({"recurrent_units": interface.units} if interface.units else {}),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,

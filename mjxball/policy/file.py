@@ -6,7 +6,7 @@ import io
 import json
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,14 @@ import numpy as np
 from mjxball.control.geometry import GEOMETRY
 from mjxball.control.network import Network
 from mjxball.control.network_interface import NetworkInterface
-from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, ObservationHistory
+from mjxball.control.observation import (
+    ACTION,
+    ACTION_SIZE,
+    OBSERVATION,
+    OBSERVATION_SIZE,
+    STALE,
+    ObservationHistory,
+)
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
 from mjxball.policy.container import PolicyFileError, read_arrays
@@ -67,7 +74,9 @@ def interface_of(metadata: dict[str, Any]) -> NetworkInterface:
     """The interface around the network of a policy file with `metadata`; the first files have no `filters`."""
     filters = tuple(metadata.get("filters", ()))
     return NetworkInterface(
-        history=ObservationHistory(metadata["previous_action"], filters, float(metadata["control_period"])),
+        history=ObservationHistory(
+            metadata["previous_action"], filters, float(metadata["control_period"]), metadata.get("stale") is True
+        ),
         action_scale=tuple(metadata["action_reach"]),
         limits=tuple(metadata["command_limits"]),
         kp=tuple(metadata["leader_kp"]),
@@ -76,6 +85,23 @@ def interface_of(metadata: dict[str, Any]) -> NetworkInterface:
         residual=metadata["action_mode"] == "residual",
         units=metadata.get("recurrent_units", 0),
         geometry=metadata["format_version"] == 5 and "context" in metadata,
+    )
+
+
+def observing_stale(policy: PolicyFile) -> PolicyFile:
+    """`policy` with the input of `follower.stale`, which has no effect yet; the same if it already has it."""
+    history = interface_of(policy.metadata).history
+    if history.stale or policy.gru is None:
+        return policy
+    place = OBSERVATION_SIZE + history.input_size
+    kernel, *others = policy.gru
+    return replace(
+        policy,
+        weights=(np.insert(policy.weights[0], place + len(others[0]), 0.0, axis=0), *policy.weights[1:]),
+        observation_mean=np.insert(policy.observation_mean, place, 0.0),
+        observation_scale=np.insert(policy.observation_scale, place, 1 / STALE),
+        metadata={**policy.metadata, "stale": True},
+        gru=(np.insert(kernel, place, 0.0, axis=0), *others),
     )
 
 

@@ -23,7 +23,7 @@ from mjxball.errors import InputError
 from mjxball.files import MissingFileError, read_bytes, read_text, write_atomically
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.container import MAX_BYTES
-from mjxball.policy.file import PolicyFile, load_file
+from mjxball.policy.file import PolicyFile, load_file, observing_stale
 from mjxball.reading import parse_json
 from mjxball.terminal import warn
 
@@ -109,6 +109,9 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
     needed = parse_json(json.dumps(configs.to_dict(config)["follower"]))
     trained = contents.metadata.get("config", {}).get("follower", {})
+    trained = {"stale": False, **trained, "privileged_critic": needed["privileged_critic"]}  # the latter is no matter
+    if config.follower.stale:
+        contents, trained["stale"] = observing_stale(contents), True
     changed = [f"follower.{name}" for name in needed if needed[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
