@@ -33,6 +33,7 @@ from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
+from mjxball.policy.file import interface_of, observing_stale
 from mjxball.sim.follower import network_interface
 from mjxball.train.environments import Environments
 
@@ -277,6 +278,34 @@ def recurrent(transport: Config) -> Recurrent:
     )
     assert network.units
     return Recurrent(config, network, policy_file(config, network_interface(config), network, steps=1234))
+
+
+def noticing_stale(contents: PolicyFile) -> PolicyFile:
+    """`contents` with the input of `follower.stale`, which changes its commands."""
+    added = observing_stale(contents)
+    interface = interface_of(added.metadata)
+    place, first = 18 + interface.history.input_size - 1, added.weights[0].copy()
+    first[interface.units + place] = np.linspace(-1, 1, first.shape[1])
+    gru = added.gru and (added.gru[0].copy(), *added.gru[1:])
+    if gru:
+        gru[0][place] = np.linspace(-1, 1, gru[0].shape[1])
+    return dataclasses.replace(added, weights=(first, *added.weights[1:]), gru=gru)
+
+
+def with_repeats(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(`seen` (T, 18) with measurements that repeat the one before, whether they do (T,)).
+
+    The object's error goes on. At other steps one number differs from the one before by a bit, the others repeat.
+    """
+    seen, steps = seen.copy(), np.arange(len(seen))
+    repeat, almost = (steps % 4 == 3) | (steps % 20 == 12), steps % 4 == 2
+    for step in range(1, len(seen)):
+        if repeat[step] or almost[step]:
+            seen[step, :12] = seen[step - 1, :12]
+        if almost[step]:
+            slot = step // 4 % 12
+            seen[step, slot] = np.nextafter(seen[step, slot], np.float32(9))
+    return seen, repeat
 
 
 @pytest.fixture(scope="session")

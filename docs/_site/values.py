@@ -45,6 +45,7 @@ MODULES = (  # known by their last name
     *(
         "mjxball.control.network_interface",
         "mjxball.control.motors",
+        "mjxball.control.observation",
         "mjxball.evaluate.metrics",
         "mjxball.evaluate.running_metrics",
         "mjxball.physics.engine",

@@ -122,15 +122,15 @@ class ObservationHistory(NamedTuple):
     @property
     def size(self) -> int:
         """Length m of the memory."""
-        return self._past + OWN_STATE * self.stale
+        return self.past_size + OWN_STATE * self.stale
 
     @property
     def input_size(self) -> int:
         """What `network_input` is longer than an observation."""
-        return self._past + self.stale
+        return self.past_size + self.stale
 
     @property
-    def _past(self) -> int:
+    def past_size(self) -> int:
         """Length of the memory of averages and the last action."""
         averages = len(self.filters) * (OBSERVATION_SIZE + ACTION_SIZE)
         return averages + (ACTION_SIZE if self.previous_action else 0)
@@ -165,12 +165,11 @@ class ObservationHistory(NamedTuple):
         parts = [observation]
         for average in self._averages(memory):
             parts += [average[..., :OBSERVATION_SIZE] - observation, average[..., OBSERVATION_SIZE:]]
-        parts.append(memory[..., self._past - ACTION_SIZE * self.previous_action : self._past])
+        parts.append(memory[..., self.past_size - ACTION_SIZE * self.previous_action : self.past_size])
         if self.stale:
-            repeats = xp.all(observation[..., :OWN_STATE] == memory[..., self._past :], axis=-1, keepdims=True)
-            parts.append(
-                xp.where(repeats, xp.asarray(STALE, dtype=observation.dtype), xp.zeros_like(parts[0][..., :1]))
-            )
+            same = xp.equal(observation[..., :OWN_STATE], memory[..., self.past_size :])
+            flag, fresh = xp.asarray(STALE, dtype=observation.dtype), xp.zeros_like(observation[..., :1])
+            parts.append(xp.where(xp.all(same, axis=-1, keepdims=True), flag, fresh))
         return xp.concat(parts, axis=-1)
 
     def mask(self, ignore_position: bool) -> list[float]:

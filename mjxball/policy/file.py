@@ -90,18 +90,17 @@ def interface_of(metadata: dict[str, Any]) -> NetworkInterface:
 
 def observing_stale(policy: PolicyFile) -> PolicyFile:
     """`policy` with the input of `follower.stale`, which has no effect yet; the same if it already has it."""
-    history = interface_of(policy.metadata).history
-    if history.stale or policy.gru is None:
+    interface = interface_of(policy.metadata)
+    if interface.history.stale:
         return policy
-    place = OBSERVATION_SIZE + history.input_size
-    kernel, *others = policy.gru
+    place = OBSERVATION_SIZE + interface.history.input_size
     return replace(
         policy,
-        weights=(np.insert(policy.weights[0], place + len(others[0]), 0.0, axis=0), *policy.weights[1:]),
+        weights=(np.insert(policy.weights[0], place + interface.units, 0.0, axis=0), *policy.weights[1:]),
         observation_mean=np.insert(policy.observation_mean, place, 0.0),
         observation_scale=np.insert(policy.observation_scale, place, 1 / STALE),
         metadata={**policy.metadata, "stale": True},
-        gru=(np.insert(kernel, place, 0.0, axis=0), *others),
+        gru=policy.gru and (np.insert(policy.gru[0], place, 0.0, axis=0), *policy.gru[1:]),
     )
 
 
@@ -288,6 +287,8 @@ def _metadata_faults(metadata: dict[str, Any]) -> Iterator[str]:
     config = metadata.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
         yield "metadata field config is not a configuration"
+    if type(metadata.get("stale", False)) is not bool:
+        yield "metadata field stale must be true or false"
     yield from _number_faults(metadata)
     if metadata["format_version"] == 5 and "context" in metadata:
         yield from _geometry_faults(metadata)

@@ -109,9 +109,10 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
     needed = parse_json(json.dumps(configs.to_dict(config)["follower"]))
     trained = contents.metadata.get("config", {}).get("follower", {})
-    trained = {"stale": False, **trained, "privileged_critic": needed["privileged_critic"]}  # the latter is no matter
     if config.follower.stale:
-        contents, trained["stale"] = observing_stale(contents), True
+        contents = observing_stale(contents)
+    trained = {**trained, "stale": contents.metadata.get("stale", False)}  # older configurations do not say it
+    trained["privileged_critic"] = needed["privileged_critic"]  # does not matter: critics are not in a policy file
     changed = [f"follower.{name}" for name in needed if needed[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")

@@ -15,7 +15,7 @@ import pytest
 import scipy.linalg
 import toys
 from command_line import TRANSPORT, assert_refused
-from conftest import with_settings
+from conftest import noticing_stale, with_settings
 from tables import weekly
 
 from mjxball.algorithms.base import Shards, TrainingPhase
@@ -26,7 +26,7 @@ from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.policy.export import policy_file
-from mjxball.policy.file import PolicyFile, load_file, shipped_policy
+from mjxball.policy.file import PolicyFile, load_file, observing_stale, save_file, shipped_policy
 from mjxball.sim.follower import network_interface
 from mjxball.train import program as programs
 from mjxball.train.environments import Environments
@@ -329,6 +329,29 @@ def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
     observations = np.random.default_rng(1).normal(size=(50, 18))
     old, new = (Policy(one, "one", np.float64) for one in (recurrent.contents, again))
     np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)
+    aware = with_settings(recurrent.config, follower={"stale": True})
+    algorithm = FirstOrderGradient(aware, Environments(TransportEnv(aware, "newton-euler"), 4))
+    begun = algorithm.start_from(algorithm.init(jax.random.key(0)), observing_stale(recurrent.contents))
+    again = policy_file(aware, network_interface(aware), algorithm.policy(begun), steps=0)
+    new, old = Policy(again, "one", np.float64), Policy(recurrent.contents, "one", np.float64)
+    observations[1::2, :12] = observations[::2, :12]
+    np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)
+
+
+def test_a_run_that_observes_stale_starts_from_a_policy_that_does_not_and_not_the_reverse(tmp_path: Path) -> None:
+    path, without = shipped_policy("universal"), preset("universal")
+    start, aware = {"policy": str(path), "sha256": file_hash(path)}, with_settings(without, follower={"stale": True})
+    assert start_policy(start, without).metadata.get("stale") is None
+    assert start_policy(start, aware).metadata["stale"] is True
+    contents = noticing_stale(load_file(path))
+    config = contents.metadata["config"]
+    config = {**config, "follower": {**config["follower"], "stale": True}}
+    path = tmp_path / "aware.npz"
+    save_file(path, dataclasses.replace(contents, metadata={**contents.metadata, "config": config}))
+    start = {"policy": str(path), "sha256": file_hash(path)}
+    np.testing.assert_array_equal(start_policy(start, aware).weights[0], contents.weights[0])
+    with pytest.raises(InputError, match=r"other settings than the run's: follower\.stale$"):
+        start_policy(start, without)
 
 
 def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:

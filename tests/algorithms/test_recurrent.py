@@ -28,7 +28,10 @@ from mjxball.control.network import gru_cell
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
+from mjxball.policy.export import policy_file
+from mjxball.policy.file import check
 from mjxball.policy.inference import NetworkController
+from mjxball.sim.follower import network_interface
 from mjxball.train.environments import Environments
 
 UNITS = 7
@@ -113,6 +116,22 @@ class Recalling(LinearQuadratic):
         )  # fmt: skip
 
 
+class Telling(Recalling):
+    """Critics alone see the number at every step."""
+
+    observation_size = Recalling.observation_size + 1
+    input_mask, critic_mask = [1.0] * (2 + UNITS) + [0.0], [1.0] * (3 + UNITS)
+
+    def reset(self, rng: Any) -> Any:
+        return self._shown(super().reset(rng))
+
+    def step(self, state: Any, action: Any) -> Any:
+        return self._shown(super().step(state, action))
+
+    def _shown(self, state: Any) -> Any:
+        return state.replace(obs=jnp.append(state.obs, state.pipeline_state[0]))
+
+
 BY_GRADIENTS = {"num_envs": 64, "horizon": EPISODE, "windows_per_episode": (1,), "policy_layers": (8,),
                 "learning_rate": 2e-2, "state_gradient_clip": 1e4}  # fmt: skip
 BY_SAC = {"num_envs": 64, "batch_size": 320, "recurrent_steps": EPISODE, "replay_size": 64_000, "policy_layers": (8,),
@@ -139,6 +158,66 @@ def test_a_gradient_passes_what_is_remembered_whole_and_the_rest_decayed(transpo
     damped, states = FirstOrderGradient(config, environments)._damped, environments.reset(jax.random.key(0))
     slope = jax.grad(lambda obs: damped(states.replace(obs=obs)).obs.sum())(states.obs)
     np.testing.assert_allclose(slope, np.broadcast_to([0.9] * 2 + [1.0] * UNITS, slope.shape), rtol=1e-6)
+
+
+def test_an_estimate_costs_its_squared_error_and_trains_the_memory(transport: Config) -> None:
+    """Against a flight of four steps by hand, whose numbers have mean 0.1 and deviation 20; weight 0 adds no layer."""
+    worlds, steps, weight = 5, 4, 0.3
+    own = {"num_envs": worlds, "horizon": steps, "windows_per_episode": (99,), "policy_layers": (8,)}
+    environments = Environments(Telling(), worlds, Shards())
+    plain, estimating = (
+        FirstOrderGradient(with_settings(transport, gradient={**own, "estimation": size}), environments)
+        for size in (0.0, weight)
+    )
+    random, known = np.random.default_rng(5), {"mean": 0.1, "square": 20.0**2 + 0.1**2, "seen": 1.0}
+    state = estimating.init(jax.random.key(1))
+    layers = jax.tree.map(lambda leaf: np.float32(random.normal(scale=0.5, size=leaf.shape)), state.layers)
+    state = state._replace(
+        **{name: np.full_like(getattr(state, name), value) for name, value in known.items()},
+        layers=layers,
+        windows=jnp.ones((), jnp.int32),  # in which no episode begins
+    )
+    first = plain.init(jax.random.key(1))
+    assert "estimate" not in first.layers
+    assert layers["estimate"]["kernel"].shape == (UNITS, 2)
+    first = first._replace(
+        **{name: getattr(state, name) for name in (*known, "windows")},
+        layers={name: layer for name, layer in layers.items() if name != "estimate"},
+    )
+    assert estimating.policy(state).layers.keys() == first.layers.keys()  # not exported
+    envs, key = environments.begin(environments.reset(jax.random.key(0))), [jax.random.key(2)]
+    with jax.default_matmul_precision("highest"):
+        found, without = (
+            jax.jit(algorithm.collect)(begun, envs, key, TRAIN)[0]
+            for algorithm, begun in ((estimating, state), (plain, first))
+        )
+        network, states, costs = estimating.policy(state), envs.states, []
+        for _ in range(steps):
+            answer = network(states.obs)
+            true = (np.asarray(states.obs[:, -1:], float) - 0.1) / 20
+            estimate = np.asarray(answer[:, 1:], float) @ layers["estimate"]["kernel"] + layers["estimate"]["bias"]
+            costs.append(np.square(estimate - np.hstack([true, np.tanh(20 * true)])).mean())
+            states = jax.vmap(Telling().step)(states, answer)
+    assert float(found.loss - without.loss) == pytest.approx(weight * np.mean(costs), rel=1e-5)
+    assert np.abs(found.slope["estimate"]["kernel"]).min() > 0
+    assert np.abs(found.slope["gru"]["kernel"] - without.slope["gru"]["kernel"]).max() > 1e-4  # float32: 1e-7
+
+
+def test_an_estimate_needs_a_memory_and_something_to_estimate(transport: Config) -> None:
+    words = "--follower.recurrent_units 48 --follower.privileged_critic true$"
+    for follower in ({"privileged_critic": True}, {"recurrent_units": 3}):
+        config = with_settings(transport, follower=follower, gradient={"estimation": 0.1})
+        with pytest.raises(InputError, match=words):
+            FirstOrderGradient(config, Environments(TransportEnv(config, "newton-euler"), 4))
+    config = with_settings(
+        transport, follower={"privileged_critic": True, "recurrent_units": 3}, gradient={"estimation": 0.1}
+    )
+    algorithm = FirstOrderGradient(config, Environments(TransportEnv(config, "newton-euler"), 4))
+    state = algorithm.init(jax.random.key(0))
+    contents = policy_file(config, network_interface(config), algorithm.policy(state), steps=0)
+    check(contents, "one")
+    begun = algorithm.start_from(state, contents)  # a policy file has no estimate: its layer begins anew
+    np.testing.assert_array_equal(begun.layers["estimate"]["kernel"], state.layers["estimate"]["kernel"])
 
 
 @pytest.mark.release

@@ -4,31 +4,37 @@ from __future__ import annotations
 
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxball.control.observation import OBSERVATION, ObservationHistory
+from mjxball.control.observation import OBSERVATION, OWN_STATE, STALE, ObservationHistory
 
 FULL = ObservationHistory(previous_action=True, filters=(0.1, 0.5), period=0.02)
+NOTICING = FULL._replace(stale=True)
 
 
 @pytest.mark.parametrize(
-    ("history", "size"),
+    ("history", "size", "shown"),
     [
-        (ObservationHistory(), 0),
-        (ObservationHistory(previous_action=True), 3),
-        (ObservationHistory(filters=(0.1,)), 21),
-        (FULL, 42 + 3),
+        (ObservationHistory(), 0, 0),
+        (ObservationHistory(previous_action=True), 3, 3),
+        (ObservationHistory(filters=(0.1,)), 21, 21),
+        (FULL, 42 + 3, 42 + 3),
+        (ObservationHistory(stale=True), 12, 1),
+        (NOTICING, 42 + 3 + 12, 42 + 3 + 1),
     ],
 )
-def test_size_is_what_the_memory_holds(history: ObservationHistory, size: int) -> None:
+def test_size_is_what_the_memory_holds(history: ObservationHistory, size: int, shown: int) -> None:
     seen = np.arange(18.0)
     memory = history.start(seen)
     assert history.size == size
     assert memory.shape == (size,)
     assert history.next(memory, seen, np.zeros(3)).shape == (size,)
-    assert history.network_input(seen, memory).shape == (18 + size,)
-    assert len(history.mask(ignore_position=True)) == 18 + size
+    assert history.input_size == shown
+    assert history.network_input(seen, memory).shape == (18 + shown,)
+    assert len(history.mask(ignore_position=True)) == 18 + shown
 
 
 def test_memory_starts_as_if_the_first_observation_had_always_been() -> None:
@@ -77,6 +83,45 @@ def test_memory_of_a_batch_is_the_memory_of_each() -> None:
     batch = FULL.next(memory, seen, action)
     np.testing.assert_array_equal(batch[2], FULL.next(memory[2], seen[2], action[2]))
     np.testing.assert_array_equal(FULL.network_input(seen, batch)[2], FULL.network_input(seen[2], batch[2]))
+
+
+def test_a_measurement_that_repeats_the_last_is_told() -> None:
+    """Not the first one, nor one that differs in a single number by one bit; the goal does not matter."""
+    random = np.random.default_rng(2)
+    for history in (ObservationHistory(stale=True), NOTICING):
+        plain = history._replace(stale=False)
+        for dtype in (np.float32, np.float64):
+            first = random.normal(size=18).astype(dtype)
+            memory = history.start(first)
+            assert history.network_input(first, memory)[-1] == 0
+            action = random.normal(size=3).astype(dtype)
+            memory = history.next(memory, first, action)
+            for other_goal in (False, True):
+                seen = first.copy()
+                seen[OWN_STATE:] += other_goal
+                shown = history.network_input(seen, memory)
+                assert shown[-1] == dtype(STALE)
+                assert shown.dtype == memory.dtype == dtype
+                np.testing.assert_array_equal(shown[:-1], plain.network_input(seen, memory[: plain.size]))
+            for slot in range(OWN_STATE):
+                seen = first.copy()
+                seen[slot] = np.nextafter(seen[slot], dtype(9))
+                assert history.network_input(seen, memory)[-1] == 0
+                after = history.next(memory, seen, action)
+                assert history.network_input(first, after)[-1] == 0  # the last measurement counts, not one before
+                assert history.network_input(seen, after)[-1] == dtype(STALE)
+
+
+def test_each_of_a_batch_is_told_of_its_own_repeats_in_numpy_and_jax() -> None:
+    random = np.random.default_rng(3)
+    first, action = (random.normal(size=(2, 3, size)).astype(np.float32) for size in (18, 3))
+    seen = first + np.float32([[[0], [1], [0]], [[1], [0], [1]]])
+    memory = NOTICING.next(NOTICING.start(first), first, action)
+    shown = NOTICING.network_input(seen, memory)
+    np.testing.assert_array_equal(shown[..., -1], np.float32([[STALE, 0, STALE], [0, STALE, 0]]))
+    traced = jax.jit(NOTICING.network_input)(jnp.asarray(seen), jnp.asarray(memory))
+    assert traced.dtype == np.float32
+    np.testing.assert_array_equal(traced, shown)
 
 
 def test_mask_hides_every_absolute_position_and_nothing_else() -> None:

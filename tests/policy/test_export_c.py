@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import call
+from conftest import Recurrent, noticing_stale, with_repeats
 from onboard_bench import compilers, needs_gcc
 from tables import weekly
 
@@ -137,6 +138,36 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tm
     policy = in_team(policy, name, Path("pair")) if name == "universal" else policy
     (tmp_path / "first.h").write_text(c_header.c_header(policy, "first", int8))
     assert_leaves_no_trace(tmp_path)
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["recurrent", *weekly("flight", "universal", "paper")])
+def test_a_repeated_measurement_is_noticed_as_by_policy(name: str, recurrent: Recurrent, tmp_path: Path):
+    """Also beside an observation that cannot be, and after a memory that cannot be, with which a flight begins anew."""
+    plain = recurrent.contents if name == "recurrent" else load_file(shipped_policy(name))
+    plain = in_team(plain, name, Path("pair")) if name == "universal" else plain
+    contents = noticing_stale(plain)
+    seen, repeats = with_repeats(observations(48))
+    policy, unaware = Policy(contents, name), Policy(plain, name)
+    wanted = np.array([policy(one) for one in seen])
+    assert np.abs(wanted - [unaware(one) for one in seen])[repeats].max(axis=1).min() > 1e-4
+    (tmp_path / "first.h").write_text(c_header.c_header(contents, "first"))
+    found = answers(tmp_path, ONE, seen)
+    assert (found[:, 0] == 0).all()
+    np.testing.assert_allclose(found[:, 4:], wanted, rtol=0, atol=2e-5)
+    between = np.insert(seen, np.flatnonzero(repeats), np.nan, axis=0)
+    np.testing.assert_array_equal(answers(tmp_path, ONE, between)[np.isfinite(between[:, 0])], found)
+    for slot in (0, 11):
+        place = interface_of(contents.metadata).history.past_size + slot
+        spoil = f"""
+            static int n;
+            volatile union {{ unsigned bits; float value; }} wild;
+            wild.bits = 0x7FC00000u;
+            if (n++ == 6) first.memory[{place}] = wild.value;"""
+        after = answers(tmp_path, ONE.replace("SPOIL", spoil), seen)
+        assert after[:, 0].tolist() == [0] * 6 + [2] + [0] * 41
+        policy.reset()
+        np.testing.assert_allclose(after[7:, 4:], [policy(one) for one in seen[7:]], rtol=0, atol=2e-5)
 
 
 @needs_gcc

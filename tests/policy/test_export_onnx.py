@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import pytest
+from conftest import Recurrent, noticing_stale, with_repeats
 from tables import rows
 
 from mjxball.errors import InputError
@@ -78,6 +79,27 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str):
         assert list(found) == ["action", "command", *(["next_memory"] if model.size else []), "valid"]
         if model.size:
             np.testing.assert_array_equal(found["next_memory"][2::2, row], found["next_memory"][1:-1:2, row])
+
+
+@rows("name", ("recurrent", *POLICIES))
+def test_a_repeated_measurement_is_noticed_as_by_policy(name: str, recurrent: Recurrent):
+    """Each row by itself: of two flights one has repeats, and an observation that cannot be before each."""
+    plain = recurrent.contents if name == "recurrent" else contents_of(name)
+    contents = noticing_stale(plain)
+    seen, repeats = with_repeats(walk(48, 1)[:, 0])
+    between = np.insert(seen, np.flatnonzero(repeats), np.nan, axis=0)
+    bad, fresh = np.isnan(between[:, 0]), walk(len(between), 1)[:, 0]
+    found = Model(contents).fly(np.stack([between, fresh], axis=1))
+    assert Model(contents).fly(walk(2, 0))["command"].shape == (2, 0, 3)
+    np.testing.assert_array_equal(found["valid"][..., 0], np.stack([~bad, np.ones_like(bad)], axis=1))
+    policy, unaware = Policy(contents, name), Policy(plain, name)
+    wanted = np.array([policy(one) for one in seen])
+    assert np.abs(wanted - [unaware(one) for one in seen])[repeats].max(axis=1).min() > 1e-4
+    np.testing.assert_allclose(found["command"][~bad, 0], wanted, rtol=0, atol=2e-5)
+    policy.reset(), unaware.reset()
+    other = np.array([policy(one) for one in fresh])
+    np.testing.assert_allclose(other, [unaware(one) for one in fresh], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(found["command"][:, 1], other, rtol=0, atol=2e-5)
 
 
 @rows("name", POLICIES[1:])

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Trained, policy_of
+from conftest import Recurrent, Trained, policy_of, with_repeats, with_settings
 
+from mjxball.algorithms.gradient import FirstOrderGradient
+from mjxball.config import Config
 from mjxball.control import observation as layout
+from mjxball.env import TransportEnv
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.export import policy_file
+from mjxball.policy.file import check, interface_of, observing_stale, shipped_policy
 from mjxball.sim.follower import network_interface
+from mjxball.train.environments import Environments
 from mjxball.train.extensions import DEFAULTS, make_env
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
@@ -174,6 +180,35 @@ class TestInference:
         together = np.stack([batch.action(OBSERVATIONS[k : k + 4]) for k in range(5)])
         alone = np.stack([single.action(OBSERVATIONS[k + 2]) for k in range(5)])
         np.testing.assert_allclose(together[:, 2], alone, rtol=0, atol=1e-5)  # float32, other order of sums
+
+
+def test_a_policy_with_the_input_of_stale_commands_the_same_until_it_is_trained(recurrent: Recurrent, tmp_path: Path):
+    """With a GRU, and without one; in a file, of whose metadata a reader that does not know the field refuses it."""
+    random = np.random.default_rng(6)
+    seen, _ = with_repeats(random.normal(scale=0.3, size=(40, 18)).astype(np.float32))
+    for contents in (recurrent.contents, *(load_file(shipped_policy(name)) for name in ("flight", "paper"))):
+        added = observing_stale(contents)
+        assert interface_of(added.metadata).input_size == interface_of(contents.metadata).input_size + 1
+        assert observing_stale(added) is added
+        save_file(tmp_path / "added.npz", added)
+        policies = (Policy(contents, "one", np.float64), Policy(load_file(tmp_path / "added.npz"), "one", np.float64))
+        commands = [[policy(row) for row in seen] for policy in policies]
+        np.testing.assert_allclose(commands[1], commands[0], rtol=0, atol=1e-12)  # sums of other lengths
+        for metadata, found in ((contents.metadata, added), (added.metadata, contents)):
+            with pytest.raises(PolicyFileError, match="observation_mean must have shape"):
+                save_file(tmp_path / "other.npz", dataclasses.replace(found, metadata=metadata))
+
+
+def test_a_policy_trained_with_stale_says_so(transport: Config):
+    """And one that was not says nothing, so that its file is the same as before."""
+    for stale, said in ((False, None), (True, True)):
+        config = with_settings(transport, follower={"stale": stale, "recurrent_units": 3})
+        env = TransportEnv(config, "newton-euler")
+        algorithm = FirstOrderGradient(config, Environments(env, 4))
+        network = algorithm.policy(algorithm.init(jax.random.key(0)))
+        contents = policy_file(config, network_interface(config), network, steps=0)
+        assert contents.metadata.get("stale") is said
+        check(contents, "one")
 
 
 def test_export_masks_what_the_network_ignores(trained):

@@ -15,7 +15,15 @@ from mjxball import __version__
 from mjxball.control.followers import MAX_OBSERVATION
 from mjxball.control.geometry import GEOMETRY_SIZE
 from mjxball.control.network_interface import NEAR_ERROR, NEAR_ERROR_RATE, NetworkInterface
-from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
+from mjxball.control.observation import (
+    ACTION_SIZE,
+    ERROR,
+    ERROR_RATE,
+    OBSERVATION,
+    OBSERVATION_SIZE,
+    OWN_STATE,
+    STALE,
+)
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, interface_of
 from mjxball.policy.formats import c_texts
@@ -80,7 +88,8 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
     arrays += [] if geometry is None else [_array("geometry", geometry)]
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
-    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.GRU if interface.units else "")
+    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.ARE_SAME if history.stale else "")
+    helpers += c_texts.GRU if interface.units else ""
     text = c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(
@@ -202,16 +211,24 @@ def _history(interface: NetworkInterface) -> str:
     lines += [f"        for (i = 0; i < {interface.size}; i++) memory[i] = 0;"]
     for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {k * width}, observation, {OBSERVATION_SIZE});"]
+    if history.stale:  # as `ObservationHistory.start`
+        lines += [f"        for (i = 0; i < {OWN_STATE}; i++) memory[{history.past_size} + i] = observation[i] + 1;"]
     if interface.geometry:
         stored = f"memory[{history.size + interface.units} + i]"
         lines += [f"        for (i = 0; i < {GEOMETRY_SIZE}; i++) {stored} = mjxball_geometry[i];"]
     lines += ["        follower->running = 1;", "    }"]
-    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
+    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.past_size});"]
     for k in range(len(history.filters)):
         offset = OBSERVATION_SIZE + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{offset} + i] -= observation[i];"]
+    if history.stale:
+        last = f"memory + {history.past_size}"
+        lines += [f"    if (!mjxball_are_finite({last}, {OWN_STATE}))"]
+        lines += ["        return mjxball_no_answer(follower, action, command);"]
+        flag = f"mjxball_are_same(observation, {last}, {OWN_STATE}) ? (mjxball_real){STALE!r} : 0"
+        lines += [f"    input[{OBSERVATION_SIZE + history.past_size}] = {flag};"]
     if interface.units:
-        lines += _saturated(interface, OBSERVATION_SIZE + history.size)
+        lines += _saturated(interface, OBSERVATION_SIZE + history.input_size)
     return "\n".join(lines)
 
 
@@ -236,7 +253,9 @@ def _history_update(interface: NetworkInterface) -> str:
         lines += [f"    mjxball_approach(memory + {offset}, observation, {OBSERVATION_SIZE}, {share});"]
         lines += [f"    mjxball_approach(memory + {offset + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
-        lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
+        lines += [f"    mjxball_copy(memory + {history.past_size - ACTION_SIZE}, action, {ACTION_SIZE});"]
+    if history.stale:
+        lines += [f"    mjxball_copy(memory + {history.past_size}, observation, {OWN_STATE});"]
     if interface.units:
         lines += [f"    mjxball_copy(memory + {history.size}, next, {interface.units});"]
     return "\n".join(lines)

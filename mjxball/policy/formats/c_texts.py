@@ -117,6 +117,13 @@ static inline void mjxball_approach(mjxball_real *average, const mjxball_real *v
     for (int i = 0; i < count; i++) average[i] += share * (value[i] - average[i]);
 }
 """
+ARE_SAME = """
+static inline int mjxball_are_same(const mjxball_real *one, const mjxball_real *other, int count) {
+    for (int i = 0; i < count; i++)
+        if (one[i] != other[i]) return 0;
+    return 1;
+}
+"""
 LAYER = """
 /* Keep products and sums as separate instructions where a fused one takes longer (Cortex-M4). */
 #ifdef __ARM_FEATURE_DSP

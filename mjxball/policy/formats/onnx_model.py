@@ -126,6 +126,20 @@ def _stack(values: Sequence[TracedArray], axis: int) -> TracedArray:
     return _joined([value[(..., None, *places)] for value in values], axis)
 
 
+def _all(value: TracedArray, axis: int, keepdims: bool) -> TracedArray:
+    """Whether all of the last axis are true, as an axis of size 1."""
+    number = TracedArray(value.graph, value.graph.add("Cast", value, to=TensorProto.FLOAT), *value.sizes)
+    total = number @ np.ones((value.sizes[-1], 1))  # no reduction, as in `_is_below`
+    return total.binary("Equal", total, np.array([value.sizes[-1]], np.float32))
+
+
+def _where(condition: TracedArray, one: Any, other: Any) -> TracedArray:
+    """`one` where `condition` is true, else `other`; they broadcast."""
+    sizes = [value.sizes if isinstance(value, TracedArray) else np.shape(value) for value in (condition, one, other)]
+    graph = condition.graph
+    return TracedArray(graph, graph.add("Where", condition, one, other), *np.broadcast_shapes(*sizes))
+
+
 def _joined(parts: Sequence[TracedArray], axis: int) -> TracedArray:
     sizes = list(parts[0].sizes)
     sizes[axis] = sum(part.sizes[axis] for part in parts)
@@ -138,6 +152,9 @@ NAMESPACE = SimpleNamespace(  # the part of the array API that controllers use
     zeros_like=lambda value: value.binary("Sub", value, value),
     tanh=lambda value: value.unary("Tanh"),
     maximum=lambda value, other: value.binary("Max", value, other),
+    equal=lambda value, other: value.binary("Equal", value, other),
+    all=_all,
+    where=_where,
     clip=lambda value, low, high: value.binary("Min", value.binary("Max", value, low), high),
     concat=_concat,
     stack=_stack,
@@ -194,11 +211,6 @@ def _is_below(limit: float, *parts: TracedArray) -> TracedArray:
     size = _concat(parts, -1).unary("Abs")
     total = size @ np.ones((size.sizes[-1], 1))  # ReduceSum fails in runtimes if N is 0
     return total.binary("Less", total, np.array([limit]))
-
-
-def _where(condition: TracedArray, one: TracedArray, other: Any) -> TracedArray:
-    """`one` (N, k) in rows where `condition` (N, 1) is true, else `other`."""
-    return TracedArray(one.graph, one.graph.add("Where", condition, one, other), *one.sizes)
 
 
 def _value(name: str, kind: int, size: int | None) -> Any:
