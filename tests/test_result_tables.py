@@ -22,15 +22,6 @@ def one(found: list[dict[str, Any]], **given: Any) -> dict[str, Any]:
     return row
 
 
-def seeds() -> Iterator[tuple[str, Numbers]]:
-    found = measured("balance_seeds")["rows"]
-    flights = [flown for row in found for flown in row["flights"]]
-    yield "failed", [max(flown["failed"] for flown in flights)]
-    yield "99 % of", [1e3 * max(flown["99 %"] for flown in flights)]
-    stable, hovers = [row["hovers"][0][0] for row in found], found[0]["hovers"][0][1]
-    yield "stable hovers", [min(stable), hovers, stable.count(hovers)]
-
-
 def stability() -> Iterator[tuple[str, Numbers]]:
     found = measured("balance_stability")
     own = [row for row in found["hovers"] if row["follower"] == "balance" and not row.get("unknown")]
@@ -96,14 +87,12 @@ def crazyflies() -> Iterator[tuple[str, Numbers]]:
 
 def onboard() -> Iterator[tuple[str, Numbers]]:
     found = measured("onboard")["inference"]
-    names = {"`balance` with": "balance, 20 units (seed 1 of six, not shipped)"}
-    for name in ("universal", "balance", "`balance` with", "flight"):
-        own = [one(found, policy=names.get(name, name), weights=weights) for weights in ("float32", "int8")]
+    for name in ("universal", "balance", "flight"):
+        own = [one(found, policy=name, weights=weights) for weights in ("float32", "int8")]
         yield name, [*(number for row in own for number in (row["flash"] / 1e3, row["ms"])), own[1]["error_rms"]]
 
 
 SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
-    "All seeds": ("results", seeds),
     "Stability": ("results", stability),
     "Ten minutes": ("results", minutes),
     "Training time": ("results", training),

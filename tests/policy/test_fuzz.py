@@ -41,7 +41,7 @@ MANY = pytest.mark.release
 @pytest.mark.parametrize("files", [140, pytest.param(10_000, marks=MANY)])
 def test_damaged_policies(files: int, tmp_path: Path) -> None:
     """At least 10 of each kind of damage."""
-    counts = damage.fuzz_policies(files, 1, tmp_path)
+    counts = damage.fuzz_policies(files, 2, tmp_path)
     assert [count for count in counts if count.faults] == []
     assert sum(count.files for count in counts) == files
     assert sum(count.loaded for count in counts) > 0, "nothing loads: the mutations are not what they say"
