@@ -48,7 +48,7 @@ def test_reprs_are_short_and_have_a_picture(config: Config) -> None:
     for shown, words, kind, count in (
         (flight, "<Trajectory 1 s, 51 steps>", "polyline", 3),
         (both, "<Trajectory 1 s, 51 steps, 2 flights>", "polyline", 2),
-        (policy, "<Policy balance: preset balance, seed 1, ", "circle", len(curve["eval_steps"])),
+        (policy, "<Policy balance: preset balance, seed 211, ", "circle", len(curve["eval_steps"])),
         (config.plant, "<Plant of 2 drones, 2.2 kg, object 0.2 kg along x>", "circle", 2),
         (preset("team").plant, "<Plant of 6 drones, ", "circle", 6),
     ):

@@ -25,10 +25,12 @@ def one(found: list[dict[str, Any]], **given: Any) -> dict[str, Any]:
 def stability() -> Iterator[tuple[str, Numbers]]:
     found = measured("balance_stability")
     own = [row for row in found["hovers"] if row["follower"] == "balance" and not row.get("unknown")]
-    worst = [max(row["radius"] for row in own), 1e3 * min(row["delay_margin"] for row in own)]
+    margins = [row["delay_margin"] for row in own]
+    worst = [max(row["radius"] for row in own), *([] if None in margins else [1e3 * min(margins)])]
     error = 1e3 * max(row["error"] for row in own)
     peaks = [1e3 * found["peaks [m]"][name] for name in ("median", "99 %", "largest")]
-    yield "22 of 22", [*worst, error, found["failed"], *peaks]
+    stable = sum(row["stable"] for row in own)
+    yield f"{stable} of {len(own)}", [*worst, error, found["failed"], *peaks]
 
 
 def minutes() -> Iterator[tuple[str, Numbers]]:
@@ -44,6 +46,15 @@ def minutes() -> Iterator[tuple[str, Numbers]]:
             "`universal`, pair" if name == "pair" else name,
             [1e3 * peak, max(row["rotor_power"] for row in own), *([max(spread)] if spread else [])],
         )
+
+
+def beyond() -> Iterator[tuple[str, Numbers]]:
+    found = measured("beyond")["rows"]
+    for case in dict.fromkeys(row["case"] for row in found):
+        if case in ("CG at 2 rad/s", "CG at 4 rad/s", "loops of 8 rad/s"):  # not on the page
+            continue
+        own = [one(found, case=case, follower=name) for name in ("balance", "sac", "lqg-calm", "lqg-world", "oracle")]
+        yield case, [None if row["error"] is None else 1e3 * row["error"] for row in own]
 
 
 def training() -> Iterator[tuple[str, Numbers]]:
@@ -95,6 +106,7 @@ def onboard() -> Iterator[tuple[str, Numbers]]:
 SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Stability": ("results", stability),
     "Ten minutes": ("results", minutes),
+    "Beyond the tracks": ("results", beyond),
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),
     "Other trainers": ("gym", trainers),
