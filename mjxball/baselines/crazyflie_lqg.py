@@ -9,10 +9,10 @@ import numpy as np
 from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
 from mjxball.baselines.crazyflie_model import MEASURED, Decay, LinearModel, linear_model
-from mjxball.baselines.linear import discretise, regulator, riccati, times
+from mjxball.baselines.linear import discretise, missed, regulator, riccati, times
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
-from mjxball.control.observation import OBSERVATION_SIZE
+from mjxball.control.observation import OBSERVATION_SIZE, OWN_STATE
 from mjxball.errors import InputError
 
 if TYPE_CHECKING:
@@ -209,6 +209,7 @@ class LqgState(NamedTuple):
     commands: Array  # (..., 16) the last eight: roll [rad] and vertical acceleration [m/s2], the newest first
     integral: Any  # (..., 3) see `CopiedPid`
     steps: Array  # (...) so far, at most `LONGEST_DELAY`
+    last: Array  # (..., 12) own state as last measured
 
 
 class CrazyflieLqg:
@@ -231,13 +232,15 @@ class CrazyflieLqg:
         xp = observation.__array_namespace__()
         zero = xp.zeros_like(observation[..., 0])
         expected = times(self._first, times(self._measurement, observation))
-        return LqgState(expected, xp.stack([zero] * 2 * LONGEST_DELAY, axis=-1), self._pid.start(observation), zero)
+        commands, integral = xp.stack([zero] * 2 * LONGEST_DELAY, axis=-1), self._pid.start(observation)
+        return LqgState(expected, commands, integral, zero, observation[..., :OWN_STATE])
 
     def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
         """See `Controller.step`."""
         xp, own = observation.__array_namespace__(), self.design
         y = times(self._measurement, observation)
-        estimate = state.expected + times(own.gain, y - times(own.measured, state.expected))
+        surprise = xp.where(missed(observation, state.last), 0.0, y - times(own.measured, state.expected))
+        estimate = state.expected + times(own.gain, surprise)
         estimate = self._actuators.bounded(estimate)
         now = times(own.now, estimate) + times(own.ahead, state.commands)
         command = self._actuators.command(now, state.commands[..., :2], own.change, own.error_limit)
@@ -248,7 +251,8 @@ class CrazyflieLqg:
         # The first measurements are of the start, where nothing moves.
         expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
         integral, copied = self._pid.step(state.integral, observation)
-        after = LqgState(expected, commands[..., :-2], integral, xp.minimum(state.steps + 1.0, LONGEST_DELAY))
+        steps = xp.minimum(state.steps + 1.0, LONGEST_DELAY)
+        after = LqgState(expected, commands[..., :-2], integral, steps, observation[..., :OWN_STATE])
         return after, self._actuators.sent(command, copied)
 
 

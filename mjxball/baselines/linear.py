@@ -6,12 +6,25 @@ import numpy as np
 from scipy.linalg import expm
 
 from mjxball.arrays import Array, matmul
+from mjxball.control.observation import OWN_STATE
+
+VELOCITIES, AT_REST = slice(6, OWN_STATE), 1e-6  # of an own state [m/s], [rad/s]; largest of a follower at rest
 
 
 def times(matrix: Array, vector: Array) -> Array:
     """Product (..., k) of `matrix` (..., k, n) and `vector` (..., n), in the dtype of `vector`; equal for any batch."""
     matrix = vector.__array_namespace__().asarray(matrix, dtype=vector.dtype)
     return matmul(matrix, vector[..., None])[..., 0]
+
+
+def missed(observation: Array, last: Array) -> Array:
+    """(..., 1) whether a moving follower's own state in `observation` (..., 18) is exactly the `last` (..., 12).
+
+    No new measurement has come then, as in a gap. At rest the state is the same with a new one.
+    """
+    xp, own = observation.__array_namespace__(), observation[..., :OWN_STATE]
+    moves = xp.any(xp.abs(own[..., VELOCITIES]) > AT_REST, axis=-1, keepdims=True)
+    return moves & xp.all(xp.equal(own, last), axis=-1, keepdims=True)
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -2,9 +2,10 @@
 
 The model (`hover_model`) has the reaction to the CG's motion, the leader's controller and disturbances: the load's
 torque, wind, errors of mass and thrust. Measurements are some control steps late; the state is predicted from there
-with the commands sent since. The assembly follows the sum of all commands. A follower therefore commands its share of
-what N drones should do minus the leader's part, and assumes that the others do the same; it uses its own measurements
-alone. Followers whose sensors disagree by constants would pull against each other for ever, hence the time constants.
+with the commands sent since. A measurement that repeats the last one, as in a gap, is left out. The assembly follows
+the sum of all commands. A follower therefore commands its share of what N drones should do minus the leader's part, and
+assumes that the others do the same; it uses its own measurements alone. Followers whose sensors disagree by constants
+would pull against each other for ever, hence the time constants.
 """
 
 from __future__ import annotations
@@ -30,11 +31,12 @@ from mjxball.baselines.hover_model import (
     LoadModel,
     hover_model,
 )
-from mjxball.baselines.linear import regulator, riccati, times
+from mjxball.baselines.linear import missed, regulator, riccati, times
 from mjxball.baselines.lqg_tuning import CALM, LONGEST_DELAY, TEAM, TEAM_CALM, TEAM_WORLD, WORLD, Costs, Tuning
 from mjxball.baselines.sharing import Assumed, Wanted, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
+from mjxball.control.observation import OWN_STATE
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -197,6 +199,7 @@ class LqgState(NamedTuple):
     expected: Array  # (..., 22) state at the time of the next measurement
     given: Array  # (..., 12) what the followers' last four commands asked for, the newest first
     steps: Array  # (...) so far, at most `LONGEST_DELAY`
+    last: Array  # (..., 12) own state as last measured
 
 
 class Lqg:
@@ -219,14 +222,15 @@ class Lqg:
         measured = self._model.in_body_axes(observation)[..., list(MEASURED)]
         unknown = [zero] * (STATES - measured.shape[-1])
         expected = joined([*(measured[..., place] for place in range(measured.shape[-1])), *unknown])
-        return LqgState(expected, xp.stack([zero] * 3 * LONGEST_DELAY, axis=-1), zero)
+        return LqgState(expected, xp.stack([zero] * 3 * LONGEST_DELAY, axis=-1), zero, observation[..., :OWN_STATE])
 
     def step(self, state: LqgState, observation: Array, privileged: PrivilegedInfo) -> tuple[LqgState, Array]:
         """See `Controller.step`."""
         xp, own, model = observation.__array_namespace__(), self.design, self._model
         seen = model.in_body_axes(observation)
         y = seen[..., list(MEASURED)]
-        x = state.expected + times(own.gain, y - times(own.measured, state.expected))
+        surprise = xp.where(missed(observation, state.last), 0.0, y - times(own.measured, state.expected))
+        x = state.expected + times(own.gain, surprise)
         carried = model.carried(privileged.believed_mass)
         wanted = own.feedback.wanted(times(own.feedback.rows, x) + times(own.ahead, state.given))
         commands, asked = self._sharing(
@@ -239,7 +243,8 @@ class Lqg:
         moved = times(own.transition, x) + times(own.drive, before)
         # The first measurements are of the start, where nothing moves.
         expected = xp.where((state.steps >= late)[..., None], moved, state.expected)
-        return LqgState(expected, given[..., :-3], xp.minimum(state.steps + 1.0, LONGEST_DELAY)), model.own(commands)
+        steps = xp.minimum(state.steps + 1.0, LONGEST_DELAY)
+        return LqgState(expected, given[..., :-3], steps, observation[..., :OWN_STATE]), model.own(commands)
 
 
 class CalmLqg(Lqg):

@@ -161,3 +161,26 @@ def test_a_variant_has_the_tuning_for_its_condition(kind, plant, attribute, monk
     monkeypatch.setattr(kind, attribute, getattr(kind, attribute)._replace(delay=4.0))
     delay, own = (float(make_controller(name, plant).design.delay) for name in ("lqg", kind.name))
     assert own == 4.0 != delay
+
+
+@pytest.mark.parametrize("kind", [Lqg, CrazyflieLqg])
+def test_a_measurement_that_repeats_the_last_is_left_out(kind: Any) -> None:
+    """Of two flights that measure the same, one knows that it is new; at rest, and where a bit differs, both do."""
+    config = PAPER if kind is Lqg else preset("flight")
+    controller, seen = kind(config), np.full((2, 18), 0.1)
+    known = PrivilegedInfo.of_believed(np.full(2, config.plant.object_mass))
+    memory, _ = controller.step(controller.start(seen), seen, known)
+    unexpected = memory._replace(expected=memory.expected + 0.01, steps=memory.steps + 10)
+
+    def after(last: Any, now: Any) -> Any:
+        return controller.step(unexpected._replace(last=last[:, :12]), now, known)[0].expected
+
+    other, still = seen.copy(), seen.copy()
+    other[1, 3] = np.nextafter(0.1, 1.0)
+    still[:, 6:12] = 0.0
+    gap, fresh = after(np.stack([seen[0], other[1]]), seen)
+    assert np.abs(gap - fresh).max() > 1e-5
+    np.testing.assert_array_equal(fresh, after(other + 1.0, seen)[1])
+    np.testing.assert_array_equal(*after(np.stack([still[0], other[1]]), still))
+    blind = after(seen, np.full((2, 18), 0.1))
+    np.testing.assert_array_equal(gap, blind[0])
