@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from tables import rows
 
 from mjxball.baselines import make_baseline, make_controller
-from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, WorldCrazyflieLqg
+from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, CrazyflieLqg, WorldCrazyflieLqg
 from mjxball.baselines.hover_model import ERRORS, LIFT_ERROR, LOAD, MEASURED, RATES, STATES, WIND
 from mjxball.baselines.lqg import MEMORY, CalmLqg, Lqg, WorldLqg, apart, noises
 from mjxball.baselines.lqg_tuning import LONGEST_DELAY, Tuning
