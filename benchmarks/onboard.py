@@ -350,7 +350,7 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> Row:
 def recurrent(units: int = UNITS) -> PolicyFile:
     """The shipped policy `flight` with a GRU of random weights in place of its network."""
     policy, random = load_file(shipped_policy("flight")), np.random.default_rng(2)
-    metadata = {field: value for field, value in policy.metadata.items() if field not in ("filters", "stale", "flown")}
+    metadata = {field: value for field, value in policy.metadata.items() if field not in ("filters", "flown")}
     metadata |= {"format_version": 5, "recurrent_units": units, "previous_action": True}
     size = interface_of(metadata).input_size
 

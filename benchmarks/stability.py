@@ -36,6 +36,7 @@ from mjxball.config import Config, preset
 from mjxball.control import rotations
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Controller, Follower
+from mjxball.control.observation import OWN_STATE
 from mjxball.evaluate.policies import load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
@@ -45,7 +46,7 @@ from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.goals import Goal
 from mjxball.sim.scenario import Scenario
-from mjxball.sim.sensors import OWN, Sample, SensorModel, SensorSettings, SensorState
+from mjxball.sim.sensors import Sample, SensorModel, SensorSettings, SensorState
 
 SETTLE, WATCHED = 3000, 1000  # control steps flown towards the fixed point, and those whose mean is taken
 NEWTON, HALVINGS = 40, 12  # then steps of Newton's method, each as short as makes the residual smallest
@@ -136,7 +137,7 @@ def closed_loop(
     def first(load: Load) -> tuple[PlantState, Any, Array]:
         plant = start_state(config, still, still, still, load.believed_mass, zero)
         observation = loop.observe(plant, goal)
-        return plant, controller.start(observation), jnp.broadcast_to(observation[:OWN], (delay, OWN))
+        return plant, controller.start(observation), jnp.broadcast_to(observation[:OWN_STATE], (delay, OWN_STATE))
 
     def start(load: Load) -> Array:
         return flat(*first(load))[0]
@@ -146,7 +147,7 @@ def closed_loop(
         position, euler, velocity, rates, rotors, memory, older = unflatten(z)
         begin, turn = jnp.zeros((), jnp.int32), rotations.quaternion_from_euler(euler)
         plant = PlantState(position, turn, velocity, rates, rotors, begin, zero, zero, zero)
-        past = jnp.concatenate([loop.observe(plant, goal)[None, :OWN], older])
+        past = jnp.concatenate([loop.observe(plant, goal)[None, :OWN_STATE], older])
         late = SensorState(SensorSettings(delay), past=past) if delay else ()
         state = LoopState(plant, loop.zero_integral(still), late, jnp.zeros((), bool))
         carry = rollout.Carry(state, loop.observe_by(past[-1], goal), memory)

@@ -51,10 +51,10 @@ def minutes() -> Iterator[tuple[str, Numbers]]:
 def beyond() -> Iterator[tuple[str, Numbers]]:
     found = measured("beyond")["rows"]
     for case in dict.fromkeys(row["case"] for row in found):
-        if case in ("CG at 2 rad/s", "CG at 4 rad/s", "loops of 8 rad/s"):  # not on the page
-            continue
-        own = [one(found, case=case, follower=name) for name in ("balance", "sac", "lqg-calm", "lqg-world", "oracle")]
-        yield case, [None if row["error"] is None else 1e3 * row["error"] for row in own]
+        names = ("lqg-calm", "lqg-world", "sac", "balance", "oracle")
+        *own, oracle = (one(found, case=case, follower=name) for name in names)
+        errors = [None if row["error"] is None else 1e3 * row["error"] for row in (*own, oracle)]
+        yield case, [*errors[:-1], own[-1]["power"], 100 * own[-1]["rotor_limit_share"], errors[-1]]
 
 
 def training() -> Iterator[tuple[str, Numbers]]:

@@ -40,7 +40,7 @@ OBSERVATION_SIZE = len(OBSERVATION)
 ACTION_SIZE = len(ACTION)
 ERROR = slice(12, 15)
 ERROR_RATE = slice(15, 18)
-OWN_STATE = 12  # numbers of the follower's own measured state, which an observation begins with
+OWN_STATE = 12  # numbers of a follower's own state, which begin an observation: position, attitude, velocity, rates
 STALE = 0.05  # input of a network where a measurement repeats the last; small, so that rare ones are not amplified
 
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Config
+from mjxball.control.observation import OWN_STATE
 from mjxball.physics.engine import has_diverged
 from mjxball.physics.mounts import own_motion
 from mjxball.sim.controllers import Body, BodyState, Controllers
-from mjxball.sim.sensors import EXACT, OWN, SensorSettings
+from mjxball.sim.sensors import EXACT, SensorSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -128,11 +129,11 @@ class ClosedLoop(Controllers):
             return seen
         own = None if plant.mount_angle is None else own_motion(plant, self._yaw)
         read = self.estimate(seen, own, load.attitude_error)
-        return read if self._sensors.object_sensor else self.observe_by(read[..., :OWN], goal.position, goal.rate)
+        return read if self._sensors.object_sensor else self.observe_by(read[..., :OWN_STATE], goal.position, goal.rate)
 
     def _measurable(self, truth: Observation) -> Array:
         """The part of `truth` that sensors measure."""
-        return truth if self._sensors.object_sensor else truth[..., :OWN]
+        return truth if self._sensors.object_sensor else truth[..., :OWN_STATE]
 
     def _observed(self, measured: Array, goal: Goal) -> Observation:
         return measured if self._sensors.object_sensor else self.observe_by(measured, goal.position, goal.rate)

@@ -1,8 +1,8 @@
 """Sensors of the followers: from their true states to the measured ones. Any batch shape, NumPy and JAX arrays.
 
-A follower measures its own position, attitude, velocity and body rates, `OWN` numbers, and computes the object's error
-from them: `p_O = p - R r`, as the flight program does. `object_sensor` adds a sensor of the object with errors of its
-own, as simulations of the paper had. Several followers have separate errors, and the same delay.
+A follower measures its own position, attitude, velocity and body rates, `OWN_STATE` numbers, and computes the
+object's error from them: `p_O = p - R r`, as the flight program does. `object_sensor` adds a sensor of the object with
+errors of its own, as simulations of the paper had. Several followers have separate errors, and the same delay.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     Measured = Float[Array, "... slots"]  # 12, or 18 with a sensor of the object: the slots of an observation
     Errors = Float[Array, "... 18"]
 
-OWN = 12  # numbers of a follower's own state: position, roll, pitch, yaw, velocity, body rates
 # Errors at level 1 are a Crazyflie's, as `benchmarks/sensor_levels.py` finds them in public flights with motion capture
 # (docs/archive/real-flights.md), in the slots of an observation; the last six are those of a sensor of the object.
 # White noise, standard deviation: position, roll and pitch and yaw, velocity, body rates.
