@@ -102,6 +102,8 @@ class FirstOrderGradient:
                 "gradient.estimation needs a recurrent network and something to estimate: "
                 "--follower.recurrent_units 48 --follower.privileged_critic true"
             )
+        share: Any = settings.exchanged_memory
+        self._exchanges = self._units and not (isinstance(share, (int, float)) and share == 0)
         self._responds_from = round(IMPULSE_RESPONSE_FROM * settings.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
@@ -154,6 +156,8 @@ class FirstOrderGradient:
         environments = self._environments
         begins = begins_episode(environments.turn, state.windows, self._config.windows_per_episode)
         envs = environments.restart(envs, keys[0], begins & phase.recording)
+        if self._exchanges:
+            envs = self._exchanged(envs, self._shards.own(jax.random.fold_in(keys[0], 2)), phase)
         # Where possible, differentiate by the initial states too: JAX then knows which carries have a gradient.
         arguments = (0, 2) if environments.smooth else (0,)
         differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
@@ -181,6 +185,16 @@ class FirstOrderGradient:
         )
         updated = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), updated, state)
         return updated, envs
+
+    def _exchanged(self, envs: Any, key: Array, phase: TrainingPhase) -> Any:
+        """`envs`, some of which get the state of another one's GRU."""
+        shift_key, own_key = jax.random.split(key)
+        seen = envs.states.obs
+        memory, count = seen[..., self._slots], len(seen)
+        other = jnp.roll(memory, jax.random.randint(shift_key, (), 1, max(count, 2)), axis=0)
+        taken = (jax.random.uniform(own_key, (count,)) < self._config.exchanged_memory) & phase.recording
+        seen = seen.at[..., self._slots].set(jnp.where(taken[:, None], other, memory))
+        return envs._replace(states=envs.states.replace(obs=seen))
 
     def _window(self, layers: Any, state: GradientState, envs: Any, impulse: Any) -> Any:
         """(loss, (envs, mean (n,) of the observations, mean (n,) of their squares)) after one window.

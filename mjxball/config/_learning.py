@@ -104,4 +104,11 @@ class Gradient:
         low=0,
         high=1e6,
     )
+    exchanged_memory: float = setting(
+        0.0,
+        "probability that a window begins with the recurrent state of another environment, so that a network learns to "
+        "correct its memory within a window and does not drift in flights longer than one",
+        low=0,
+        high=1,
+    )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
