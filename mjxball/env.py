@@ -441,11 +441,31 @@ class TransportEnv:
         return jnp.where(most[..., None] > 0, share, 0.5).reshape(-1)
 
     def _spread(self, commands: Float[Array, "followers 3"], rig: Any) -> Float[Array, "followers 3"]:
-        """Deviation of each command from the mean over the followers that fly; 0 for padding."""
+        """What of the commands moves nothing; 0 for padding.
+
+        Of roll and pitch this is the deviation from the mean over the followers that fly. Of the vertical command it is
+        the deviation from the plane over the mounts that fits best: a plane turns the load.
+        """
+        followers = np.array(self.config.plant.followers)
         if rig == ():
-            return commands - commands.mean(axis=0)
-        flies = (rig.drone_mass[np.array(self.config.plant.followers)] > 0)[:, None]
-        return flies * (commands - (flies * commands).sum(axis=0) / flies.sum())
+            mounts = np.array([drone.mount for drone in self.config.plant.drones])[followers]
+            flies: Any = np.ones(len(followers))
+        else:
+            mounts, flies = rig.mounts[followers], (rig.drone_mass[followers] > 0).astype(jnp.float32)
+        rest = flies[:, None] * commands
+        mean = rest.sum(axis=0) / flies.sum()
+        vertical: Array = rest[:, 2]
+        axes: list[Array] = []
+        for direction in (flies, flies * mounts[:, 0], flies * mounts[:, 1]):
+            axis = direction
+            for other in axes:
+                axis = axis - (axis * other).sum() * other
+            length = jnp.sqrt((axis * axis).sum() + 1e-12)
+            # Of one or two followers, or of some in a line, a direction is none of its own.
+            axis = jnp.where(length > 1e-3 * jnp.sqrt((direction * direction).sum() + 1e-12), axis / length, 0.0 * axis)
+            vertical = vertical - (vertical * axis).sum() * axis
+            axes.append(axis)
+        return jnp.concatenate([flies[:, None] * (commands - mean)[:, :2], vertical[:, None]], axis=-1)
 
     @staticmethod
     def report(totals: Any, peaks: Any, count: float, evaluation: bool) -> dict[str, Any]:

@@ -347,3 +347,20 @@ def test_padded_worlds_move_alike_on_mjx_and_in_closed_form() -> None:
         plants.append(state.pipeline_state.plant)
     for name in ("position", "velocity", "quaternion", "rates"):
         np.testing.assert_allclose(getattr(plants[0], name), getattr(plants[1], name), rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("size", [2, 3, 4, 6])
+def test_the_spread_of_commands_is_what_moves_nothing(size: int) -> None:
+    """Vertical commands against NumPy's least squares: those that lie in a plane over the mounts turn the load."""
+    env = TransportEnv(settings(scenario__team_sizes=SIZES), "newton-euler")
+    rig = env.reset(jax.random.key(0), SIZES.index(size)).pipeline_state.parameters
+    flying, random = size - 1, np.random.default_rng(size)
+    mounts, commands = np.asarray(rig.mounts)[1:, :2], random.normal(size=(5, 3))
+    assert np.abs(mounts[:flying]).max() > 0.1
+    plane = np.concatenate([np.ones((5, 1)), mounts], axis=1)[:flying]
+    solved = plane @ np.linalg.lstsq(plane, commands[:flying, 2], rcond=1e-6)[0]
+    wanted = np.zeros((5, 3))
+    wanted[:flying, :2] = commands[:flying, :2] - commands[:flying, :2].mean(axis=0)
+    wanted[:flying, 2] = commands[:flying, 2] - solved
+    np.testing.assert_allclose(env._spread(jnp.asarray(commands), rig), wanted, atol=2e-6)  # float32
+    assert (np.abs(wanted[:, 2]).max() > 0.1) == (size > 4)  # up to three lie in a plane

@@ -67,6 +67,11 @@ class FirstOrderGradient:
     `gradient.state_gradient_clip` limits it in each environment. The gradient of a recurrent network's state is neither
     decayed nor clipped, so that the network learns to remember. `gradient.impulse_response` weights a cost of poorly
     damped closed loops, however small the errors of the flight.
+
+    The gradient sees no longer than a window. A memory that fades within one window is therefore trained whole, but
+    one that drifts over several is not: its error of tens of seconds later costs nothing now. With
+    `gradient.exchanged_memory` some windows begin with the memory of another environment, which the network must
+    learn to correct.
     """
 
     metrics = ("loss", "gradient_norm")
@@ -103,7 +108,9 @@ class FirstOrderGradient:
                 "--follower.recurrent_units 48 --follower.privileged_critic true"
             )
         share: Any = settings.exchanged_memory
-        self._exchanges = self._units and not (isinstance(share, (int, float)) and share == 0)
+        self._exchanges = not (isinstance(share, (int, float)) and share == 0)
+        if self._exchanges and not self._units:
+            raise InputError("gradient.exchanged_memory needs a recurrent network: --follower.recurrent_units 48")
         self._responds_from = round(IMPULSE_RESPONSE_FROM * settings.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
@@ -187,13 +194,13 @@ class FirstOrderGradient:
         return updated, envs
 
     def _exchanged(self, envs: Any, key: Array, phase: TrainingPhase) -> Any:
-        """`envs`, some of which get the state of another one's GRU."""
-        shift_key, own_key = jax.random.split(key)
+        """`envs`, each of which gets the state of another one's GRU with probability `exchanged_memory`."""
+        whose_key, own_key = jax.random.split(key)
         seen = envs.states.obs
-        memory, count = seen[..., self._slots], len(seen)
-        other = jnp.roll(memory, jax.random.randint(shift_key, (), 1, max(count, 2)), axis=0)
+        memory, count = seen[:, self._slots], len(seen)
+        other = jnp.roll(memory, jax.random.randint(whose_key, (), 1, max(count, 2)), axis=0)
         taken = (jax.random.uniform(own_key, (count,)) < self._config.exchanged_memory) & phase.recording
-        seen = seen.at[..., self._slots].set(jnp.where(taken[:, None], other, memory))
+        seen = seen.at[:, self._slots].set(jnp.where(taken[:, None], other, memory))
         return envs._replace(states=envs.states.replace(obs=seen))
 
     def _window(self, layers: Any, state: GradientState, envs: Any, impulse: Any) -> Any:

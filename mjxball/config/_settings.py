@@ -183,8 +183,8 @@ class Reward:
     )
     spread: float = setting(
         0.0,
-        "weight of the squared differences of a follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command to "
-        "the mean of all followers",
+        "weight of the squares of what in the followers' commands moves nothing: roll and pitch less their mean "
+        "[1/rad2], vertical accelerations less the plane over the mounts that fits them best [1e-2 s4/m2]",
         low=0,
         high=1e9,
     )

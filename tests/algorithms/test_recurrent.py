@@ -220,6 +220,62 @@ def test_an_estimate_needs_a_memory_and_something_to_estimate(transport: Config)
     np.testing.assert_array_equal(begun.layers["estimate"]["kernel"], state.layers["estimate"]["kernel"])
 
 
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_windows_begin_with_the_memory_of_another_environment(share: float, transport: Config) -> None:
+    """Some rows, no row its own; nothing else of an observation changes, and nothing at all in an evaluation."""
+    worlds = 200
+    own = {"num_envs": worlds, "policy_layers": (8,), "exchanged_memory": share}
+    environments = Environments(Recalling(), worlds, Shards())
+    algorithm = FirstOrderGradient(with_settings(transport, gradient=own), environments)
+    envs = environments.begin(environments.reset(jax.random.key(0)))
+    before = np.random.default_rng(3).normal(size=envs.states.obs.shape).astype(np.float32)
+    envs = envs._replace(states=envs.states.replace(obs=jnp.asarray(before)))
+    evaluating = TrainingPhase(random=jnp.zeros((), bool), evaluate=jnp.ones((), bool))
+    found, same = (
+        np.asarray(algorithm._exchanged(envs, jax.random.key(4), phase).states.obs) for phase in (TRAIN, evaluating)
+    )
+    np.testing.assert_array_equal(same, before)
+    np.testing.assert_array_equal(found[:, :2], before[:, :2])
+    rows = [int(np.flatnonzero((before[:, 2:] == memory).all(axis=1))[0]) for memory in found[:, 2:]]
+    others = sum(row != number for number, row in enumerate(rows))
+    assert others == worlds if share == 1 else 0.25 * worlds < others < 0.55 * worlds  # four deviations
+
+
+def test_exchanging_memories_needs_one(transport: Config) -> None:
+    config = with_settings(transport, gradient={"exchanged_memory": 0.1})
+    with pytest.raises(InputError, match=r"--follower.recurrent_units 48$"):
+        FirstOrderGradient(config, Environments(TransportEnv(config, "newton-euler"), 4))
+
+
+def test_a_window_flies_on_with_exchanged_memories(transport: Config) -> None:
+    """At share 1 its loss is that of the same flights with all memories passed on by some number of rows."""
+    worlds = 6
+    own = {**BY_GRADIENTS, "num_envs": worlds, "windows_per_episode": (99,)}
+    environments = Environments(Recalling(), worlds, Shards())
+    begun = environments.begin(environments.reset(jax.random.key(0)))
+    memory = jax.random.normal(jax.random.key(6), (worlds, UNITS))
+
+    def losses(share: float, passed_on: range) -> list[float]:
+        config = with_settings(transport, gradient={**own, "exchanged_memory": share})
+        algorithm = FirstOrderGradient(config, environments)
+        state = algorithm.init(jax.random.key(1))
+        layers = jax.tree.map(lambda leaf: 0.5 * jax.random.normal(jax.random.key(5), leaf.shape), state.layers)
+        known = {"square": state.square + 1, "seen": jnp.ones(()), "windows": jnp.ones((), jnp.int32)}
+        collect, found = jax.jit(algorithm.collect), []
+        for number in passed_on:
+            seen = begun.states.obs.at[:, 2:].set(jnp.roll(memory, number, axis=0))
+            envs = begun._replace(states=begun.states.replace(obs=seen))
+            collected, _ = collect(state._replace(layers=layers, **known), envs, [jax.random.key(2)], TRAIN)
+            found.append(float(collected.loss))
+        return found
+
+    own_memory, *others = losses(0.0, range(worlds))
+    (exchanged,) = losses(1.0, range(1))
+    differences = np.abs(np.array(others) - exchanged)
+    assert differences.min() < 1e-5
+    assert abs(own_memory - exchanged) > 1e-3
+
+
 @pytest.mark.release
 def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent) -> None:
     """The loss beside flights, one with a small impulse of the first action: observations, actions, GRU and all."""
