@@ -1,4 +1,4 @@
-"""The controllers of a pair in flight: one control step of the leader's PID and the follower's policy."""
+"""The controllers of a pair in flight: one control step of the leader's PID and of the follower."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from mjxball.control import rotations
 from mjxball.policy import Policy
 from mjxball.sim.controllers import Body, Controllers
+from mjxfly.classical import ClassicalFollower
 from mjxfly.policy_setup import config_of, mount_angle
 
 
@@ -22,16 +23,16 @@ class PairCommands(NamedTuple):
 
 
 class FlightController:
-    """Leader PID and follower policy, with the gains, limits and control period of the policy's configuration."""
+    """Leader PID and follower, with the gains, limits and control period of the follower's configuration."""
 
-    def __init__(self, policy: Policy):
+    def __init__(self, policy: Policy | ClassicalFollower):
         config = config_of(policy.metadata)
         self.policy, self.config, self.period = policy, config, policy.control_period
         self._controllers, self._angle = Controllers(config), mount_angle(policy.metadata)
         self.reset()
 
     def reset(self) -> None:
-        """Begin a flight: zero the integrals and the policy's hidden state."""
+        """Begin a flight: zero the integrals and what the follower remembers."""
         self._integral = self._controllers.zero_integral(np.zeros(3))
         self.policy.reset()
 

@@ -15,11 +15,13 @@ from pathlib import Path
 from mjxball import cli, terminal
 from mjxball.control.crazyflie import PairGains
 from mjxball.errors import InputError
-from mjxball.policy import Policy, policy_path
+from mjxball.policy import policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.running import run_command
 from mjxfly import app_flight, clock, limits
 from mjxfly.app import generate
+from mjxfly.classical import NAMES as CLASSICAL
+from mjxfly.classical import PLANT, is_classical
 from mjxfly.controller import FlightController
 from mjxfly.crazyswarm import CrazyswarmPair, read_pair
 from mjxfly.display import live_view
@@ -33,6 +35,7 @@ from mjxfly.policy_setup import (
     goal_of,
     is_crazyflie,
     limits_of,
+    load_follower,
     load_policy,
     motor_of,
     times_of,
@@ -81,19 +84,19 @@ def make_parser() -> cli.Parser:
         every = {flag for action in parser._actions for flag in action.option_strings}
         return {"policy", *every} - rare
 
-    about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
-    usage = (
-        "%(prog)s POLICY.npz --leader URI --follower URI [FLAG ...]\n       %(prog)s POLICY.npz --rehearse [FLAG ...]"
-    )
+    about = "Fly a follower with two Crazyflies, or rehearse it with their software twin."
+    usage = "%(prog)s FOLLOWER --leader URI --follower URI [FLAG ...]\n       %(prog)s FOLLOWER --rehearse [FLAG ...]"
     parser = cli.make_parser("python -m mjxfly", about, usage=usage, describe=common)
-    policy = "the follower, a file or a shipped one's name"
-    parser.add_argument("policy", type=policy_path, metavar="POLICY.npz", help=policy)
+    policy = f"the follower: a policy file, a shipped one's name, or {', '.join(CLASSICAL)}, which need no file"
+    parser.add_argument("policy", type=policy_path, metavar="FOLLOWER", help=policy)
 
     add = parser.add_argument_group("the drones").add_argument
     add("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
     add("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
     about = "links and parameters of two robots of a Crazyswarm2 file; --leader and --follower then are names in it"
     add("--crazyflies", type=Path, metavar="FILE.yaml", help=about)
+    about = f"the rig that {', '.join(CLASSICAL)} know: a shipped plant or a file ({PLANT})"
+    add("--plant", type=Path, metavar="NAME|FILE", help=about)
     add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")
     add("--slow", type=float, metavar="FACTOR", help="--rehearse: on a clock so many times slower than real time (1)")
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
@@ -276,6 +279,7 @@ def rehearsed_options(options: argparse.Namespace) -> list[str]:
     """The twin's flags that name the pair: ports, policy, apps."""
     ports = [uri.rsplit(":", 1)[1] if uri else "0" for uri in (options.leader, options.follower)]
     pair = ["--ports", *ports, "--policy", str(options.policy)]
+    pair += ["--plant", str(options.plant)] if options.plant is not None else []
     pair += ["--onboard", options.onboard] if options.onboard else []
     return pair
 
@@ -290,6 +294,8 @@ def on_board(
     options: argparse.Namespace, setup: FlightSetup, settings: FlightSettings
 ) -> tuple[FlightSetup, FlightSettings]:
     """`setup` and `settings` for --onboard. Raises InputError for a policy that cannot run on board."""
+    if is_classical(options.policy):
+        raise InputError(f"--onboard runs a network in C, and {options.policy} is none: name a policy")
     if options.thrust or options.hover or options.mass:
         raise InputError("--onboard flies the thrust map in the app: leave --thrust, --hover and --mass out")
     policy, name = load_policy(options.policy), options.policy.stem
@@ -311,7 +317,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_twin_options(options)
         capture = mocap_settings(options, links)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
-        policy = Policy(load_policy(options.policy), options.policy.stem)
+        policy = load_follower(options.policy, options.plant)
         controller = FlightController(policy)
         config = controller.config
         choice = ThrustOptions(options.thrust, options.hover, options.curve, options.mass)

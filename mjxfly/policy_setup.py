@@ -13,7 +13,10 @@ from mjxball.config import Config
 from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
-from mjxball.policy import PolicyFile, load_file, team
+from mjxball.errors import InputError
+from mjxball.policy import Policy, PolicyFile, load_file, team
+from mjxfly.classical import NAMES as CLASSICAL
+from mjxfly.classical import ClassicalFollower, classical, is_classical
 from mjxfly.limits import Limits, Times
 from mjxfly.setpoints import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxfly.telemetry import Rig
@@ -30,6 +33,15 @@ def load_policy(path: Path) -> PolicyFile:
     if not team.is_for_any(contents.metadata):
         return contents
     return team.in_team(contents, path.stem, plant_setup(team.CRAZYFLIES))
+
+
+def load_follower(path: Path, plant: Path | None = None) -> Policy | ClassicalFollower:
+    """The follower that `path` names: a policy file, or a classical one for the rig `plant`. Raises InputError."""
+    if is_classical(path):
+        return classical(str(path), plant)
+    if plant is not None:
+        raise InputError(f"--plant is for {', '.join(CLASSICAL)}: a policy flies the plant in its metadata")
+    return Policy(load_policy(path), path.stem)
 
 
 def config_of(metadata: Mapping[str, Any]) -> Config:

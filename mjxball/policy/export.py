@@ -29,7 +29,7 @@ def policy_file(
     metadata.
     """
     weights, biases = _layers(learnt)
-    follower, leader = config.follower, config.leader
+    follower = config.follower
     size = (
         interface.input_size
     )  # further inputs are a GRU's state, and those of critics alone, whose weights are not exported
@@ -48,16 +48,7 @@ def policy_file(
         "action_mode": follower.action,
         **({"context": list(GEOMETRY)} if interface.geometry else {}),
         "action_reach": action_scale,
-        "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
-        "leader_kp": list(leader.kp),
-        "leader_kd": list(leader.kd),
-        "gravity": config.plant.gravity,
-        "control_period": config.timing.control_period,
-        "plant": to_dict(config.plant),
-        **({"firmware": firmware(config)} if config.autopilot.kind == "crazyflie" else {}),
-        "preset": config.preset,
-        "config": to_dict(config),
-        "config_hash": config_hash(config),
+        **flight_record(config),
         "package_version": __version__,
         "training_steps": int(steps),
         "bounds": {name: bound for name, bound in to_dict(config.bounds).items() if bound > 0},
@@ -77,6 +68,22 @@ def policy_file(
         metadata=metadata,
         gru=_gru(learnt),
     )
+
+
+def flight_record(config: Config) -> dict[str, Any]:
+    """The part of a policy's metadata that a flight needs, for a follower that was made for `config`."""
+    return {
+        "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
+        "leader_kp": list(config.leader.kp),
+        "leader_kd": list(config.leader.kd),
+        "gravity": config.plant.gravity,
+        "control_period": config.timing.control_period,
+        "plant": to_dict(config.plant),
+        **({"firmware": firmware(config)} if config.autopilot.kind == "crazyflie" else {}),
+        "preset": config.preset,
+        "config": to_dict(config),
+        "config_hash": config_hash(config),
+    }
 
 
 def _layers(learnt: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:

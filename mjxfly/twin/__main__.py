@@ -24,7 +24,7 @@ from mjxball.running import run_command
 from mjxball.terminal import say
 from mjxfly import clock
 from mjxfly.app.host import compile_pair
-from mjxfly.policy_setup import config_of, is_crazyflie, load_policy
+from mjxfly.policy_setup import config_of, is_crazyflie, load_follower, load_policy
 from mjxfly.process import urgent
 from mjxfly.rehearsal import BEAT, LAST
 from mjxfly.telemetry import Rig
@@ -45,7 +45,8 @@ def main() -> int:
     """Command line of the twin; returns the exit code."""
     parser = make_parser("python -m mjxfly.twin", __doc__ or "")
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
-    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its metadata define the rig")
+    parser.add_argument("--policy", type=Path, default=None, metavar="FOLLOWER", help="its metadata define the rig")
+    parser.add_argument("--plant", type=Path, default=None, metavar="NAME|FILE", help="that of a classical follower")
     for name in ("loss", "delay", "jitter"):
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
     parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")
@@ -59,11 +60,12 @@ def main() -> int:
 def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` describe until standard input ends; return the exit code."""
     clock.slow_down(options.slow)
-    policy = load_policy(options.policy) if options.policy else None
-    metadata = policy.metadata if policy else None
+    metadata = load_follower(options.policy, options.plant).metadata if options.policy else None
     if metadata is None or not is_crazyflie(config_of(metadata)):
         check_simple(options, options.fault)
-    cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
+    cores = None
+    if options.policy and options.onboard:
+        cores = compile_pair(load_policy(options.policy), options.policy.stem, options.onboard == "int8")
     kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")
     with urgent(), Twin(make_pair(metadata, kind, surroundings(options)), tuple(options.ports), cores) as twin:
         worse = LinkFaults(options.loss, options.delay, options.jitter)

@@ -1,0 +1,106 @@
+"""Hover of two Crazyflies on the software twin: learned and classical followers in the same conditions.
+
+`python -m mjxfly FOLLOWER --rehearse` in virtual time (`virtual_twin.py`): take-off, 20 s at 0.4 m, landing. The load
+moves by 1 cm at 0.7 rad/s. Errors of O are those from 5 s after both controllers took over; sideways is its largest
+horizontal distance from the start before that. Of every number the worst of the seeds is kept.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from harness import Row, arguments, say, table, write
+from mjxball.control.crazyflie import FULL
+from mjxball.policy import policy_path
+from mjxball.running import run_command
+from mjxfly.controller import FlightController
+from mjxfly.limits import FlightSettings
+from mjxfly.policy_setup import drone_of, goal_of, load_follower
+from mjxfly.twin.conditions import Surroundings, drone_kind
+from virtual_twin import VirtualTwin
+
+SECONDS, SETTLED = 20.0, 5.0
+CASES = {
+    "as delivered": Surroundings(),
+    "10 ms each way": Surroundings(delay=0.01),
+    "noise x 3": Surroundings(noise=3.0),
+    "pose at 20 Hz": Surroundings(pose_hz=20.0),
+    "thrust -5/+5 %": Surroundings(gains=(0.95, 1.05)),
+    "thrust -8/+8 %": Surroundings(gains=(0.92, 1.08)),
+    "thrust -5/-5 %": Surroundings(gains=(0.95, 0.95)),
+}
+# (drone of `DRONES`, shipped plant, shipped policy) and the classical followers beside it
+DRONES = (
+    ("2.1", "crazyflie", "flight"),
+    ("thrust-upgrade", "crazyflie-thrust-upgrade", "flight-upgrade"),
+    ("brushless", "crazyflie-brushless", "flight-brushless"),
+)
+CLASSICAL = ("lqg", "lqg-calm", "lqg-world")
+WORST = ("rms", "largest", "sideways", "tilt", "limit", "change", "touchdown")
+
+
+def flown(follower: str, plant: str | None, case: str, seed: int) -> Row:
+    """One flight."""
+    one = load_follower(policy_path(follower), None if plant is None else Path(plant))
+    config = FlightController(one).config
+    surroundings = replace(CASES[case], seed=seed)
+    settings = FlightSettings(seconds=SECONDS, goal=goal_of(config))
+    world = VirtualTwin(one, settings, kind=drone_kind(drone_of(config)), surroundings=surroundings)
+    end = world.run()
+    flying = [moment for moment in world.track if moment.state == "fly"]
+    if not flying:
+        return {"end": end, **dict.fromkeys(WORST, math.inf)}
+    begun = flying[0].time
+    late = [moment for moment in flying if moment.time > begun + SETTLED]
+    goal = np.array(goal_of(config)) + np.array([0.0, 0.0, world.rest])
+    errors = np.array([np.linalg.norm(moment.position - goal) for moment in late])
+    early = np.array([moment.position[:2] for moment in world.track if moment.time <= begun + SETTLED])
+    sent = [
+        record["sent"] for record in world.log.records if record["kind"] == "tick" and record["t"] > begun + SETTLED
+    ]
+    rolls = np.radians([[one.roll for one in both] for both in sent[: len(late)]])
+    pwm = np.array([moment.pwm for moment in late])
+    return {
+        "end": end if len(flying) * settings.period > SECONDS - 1 else "not all flown",
+        "rms": float(np.sqrt((errors**2).mean())),  # [m]
+        "largest": float(errors.max()),  # [m]
+        "sideways": float(np.hypot(*early.T).max()),  # [m]
+        "tilt": float(max(moment.tilt for moment in late)),  # [rad]
+        "limit": float((pwm >= FULL).mean(axis=0).max()),  # share of the time of the motor that is longest at one
+        "change": float(np.sqrt((np.diff(rolls[:, 1]) ** 2).mean())),  # of the follower's roll from step to step [rad]
+        "touchdown": world.touchdown_speed(),  # [m/s]
+    }
+
+
+def main(given: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = arguments(__file__, __doc__ or "")
+    parser.add_argument("--drones", nargs="+", choices=[name for name, *_ in DRONES], help="kinds (all)")
+    parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="conditions (all)")
+    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="flights of each (2)")
+    options = parser.parse_args(given)
+    rows: list[Row] = []
+    for drone, plant, policy in DRONES:
+        if options.drones and drone not in options.drones:
+            continue
+        for case in options.cases:
+            for follower in (policy, *CLASSICAL):
+                own = plant if follower in CLASSICAL else None
+                found = [flown(follower, own, case, seed) for seed in range(options.seeds)]
+                ends = sorted({one["end"] for one in found})
+                worst = {name: max(one[name] for one in found) for name in WORST}
+                rows.append({"drone": drone, "case": case, "follower": follower, "end": ", ".join(ends), **worst})
+                say(rows[-1])
+    table(rows)
+    write(options.json, {"rows": rows})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main))
