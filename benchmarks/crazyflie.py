@@ -1,7 +1,7 @@
 """The Crazyflie pair: does the ball stay on the stick of the stand, and does the pair fly whatever the rig?
 
 - stand: flights of 60 s from random ball offsets, rolls and heights, undisturbed. The ball is kept if it never touches
-  an end stop; shares over all starts, of copy, adaptive, LQG and the policy.
+  an end stop; shares over all starts.
 - flight: rigs sampled as in the training of the preset (thrust of both and of each, motor lag, inertia, object mass,
   CG motion, noise, delay, gusts, battery, firmware): only rigs that can hover are sampled. 20 s each; a crash is |e_o|
   beyond d_term or a world that diverges. RMSE and tilt after 5 s, of the same followers in the same worlds. All see the
@@ -35,7 +35,7 @@ from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
 SECONDS, SETTLED = 20.0, 5.0
-CLASSICAL = ("copy", "adaptive", "lqg")
+CLASSICAL = ("copy", "adaptive", "lqg", "lqg-calm", "lqg-world")
 
 
 def followers(path: Path, config: Config) -> list[Follower]:
