@@ -27,13 +27,14 @@ import numpy as np
 
 from harness import Row, arguments, table, write
 from mjxball.policy import Policy, load_file
-from mjxball.policy.file import shipped_policy
+from mjxball.policy.file import policy_path, shipped_policy
 from mjxball.running import run_command
 from mjxfly.app.host import Library, compile_pair
+from mjxfly.classical import ClassicalFollower
 from mjxfly.controller import FlightController
 from mjxfly.figures import SETTLING
 from mjxfly.limits import FlightSettings
-from mjxfly.policy_setup import goal_of, limits_of, times_of
+from mjxfly.policy_setup import goal_of, limits_of, load_follower, times_of
 from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
 from virtual_twin import MemoryLog, TrueState, VirtualTwin
@@ -131,7 +132,7 @@ FAULTS: dict[str, Injection] = {
 }
 
 
-def settings_of(policy: Policy, seconds: float) -> FlightSettings:
+def settings_of(policy: Policy | ClassicalFollower, seconds: float) -> FlightSettings:
     """What the command line would make of `policy`'s metadata."""
     config = FlightController(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
@@ -146,7 +147,7 @@ def cores_of(path: Path, weights: str) -> tuple[Library, Library]:
 
 def hover_on(path: Path, system: str, number: int, fault: str = "") -> Row:
     """A flight of 20 s under both controllers on positioning `system`; `fault` of the leader in its middle."""
-    policy = Policy.load(path)
+    policy = load_follower(path)
     settings = settings_of(policy, 4 * SETTLING)
     if system == "flow":
         settings = replace(settings, limits=replace(settings.limits, variance=math.inf, noise=10.0, stick_error=10.0))
@@ -183,7 +184,7 @@ def positionings(options: argparse.Namespace) -> list[Row]:
 
 def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
     """The pair `SETTLED` [s] under both controllers, which are `onboard` (float32, int8) or on the laptop."""
-    policy = Policy.load(path)
+    policy = load_follower(path)
     world = VirtualTwin(
         policy,
         settings_of(policy, HOVER),
@@ -307,7 +308,7 @@ def show(rows: Sequence[Row]) -> None:
 def main(given: Sequence[str] | None = None) -> int:
     """Run the campaign; returns 1 if a motor still turned."""
     parser = arguments(__file__, __doc__)
-    parser.add_argument("--policy", type=Path, default=shipped_policy("flight"), metavar="FILE")
+    parser.add_argument("--policy", type=policy_path, default=shipped_policy("flight"), metavar="FOLLOWER")
     parser.add_argument("--trials", type=int, default=1, help="flights of each fault at each drone")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", nargs="+", choices=FAULTS, metavar="FAULT", help="these faults alone")

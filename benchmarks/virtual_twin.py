@@ -20,6 +20,7 @@ from mjxball.policy import Policy
 from mjxfly import app_flight, packets, positioning
 from mjxfly.app.host import Library
 from mjxfly.app.protocol import APP_VARIABLES, sample_of
+from mjxfly.classical import ClassicalFollower
 from mjxfly.controller import FlightController
 from mjxfly.flight import Flight
 from mjxfly.limits import NAMES, FlightSettings
@@ -159,7 +160,7 @@ class VirtualTwin:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: Policy | ClassicalFollower,
         settings: FlightSettings | None = None,
         *,
         kind: DroneKind = DELIVERED,

@@ -140,6 +140,13 @@ ten_minutes = {
     for name in ("team3", "team4", "team6")
 }
 
+# rms change of the follower's roll from step to step on the twin as delivered [rad]
+change = {
+    row["follower"]: row["change"]
+    for row in results("twin_hover")["rows"]
+    if (row["drone"], row["case"]) == ("2.1", "as delivered")
+}
+
 NAMES: dict[str, Any] = {
     **{name.rpartition(".")[2]: importlib.import_module(name) for name in MODULES},
     **{name: value for name, value in globals().items() if not name.startswith("_")},
@@ -162,6 +169,7 @@ NAMES: dict[str, Any] = {
     "lift": 8 * full / 9.81 / total_mass(rig),  # share of the weight that a battery of 3 V carries
     "ten_minutes": SimpleNamespace(**ten_minutes),
     "silent": [row for row in results("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"],
+    "twin": SimpleNamespace(calmer=round(change["flight"] / change["lqg"])),
     "kept": {row["follower"]: row["kept"] * row["starts"] for row in results("crazyflie")["stand"]},
     "upload": len(weight_bytes(file.load_file(file.shipped_policy("flight")))),
 }
