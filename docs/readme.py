@@ -41,10 +41,11 @@ COLUMNS = (
         "follower",
         "success [%]",
         "mass unknown [%]",
-        "arrival over the oracle's",
-        "90 % quantile of the error then [mm]",
+        "error then, 90 % [mm]",
     ),
     "rotor at its limit [%]",
+    "power over hover",
+    "change of commands [mrad]",
 )
 
 Tracks = dict[str, dict[str, Any]]  # an entry's results of each track and condition
@@ -60,7 +61,8 @@ def shown(tracks: Tracks, track: str, head: str) -> str:
 def row(text: str, tracks: Tracks) -> str:
     """One line of the table."""
     columns = (("pair", "success %"), ("pair-unknown", "success %"))
-    columns += (("pair", "arrival"), ("pair", "late mm"), ("pair", "limit %"))
+    columns += (("pair", "late mm"), ("pair", "limit %"))
+    columns += (("pair", "power"), ("pair", "change mrad"))
     return " | ".join([text, *(shown(tracks, *column) for column in columns)])
 
 

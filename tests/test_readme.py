@@ -69,7 +69,7 @@ def test_the_block_has_a_row_for_every_entry_and_names_the_best(entered: Any) ->
     text = entered(copy={"pair": usual}, lqg={"pair": better, "pair-unknown": usual}, balance={"pair": usual})
     rows = [line.split(" | ") for line in text.splitlines() if line.count(" | ")]
     assert [row[0].strip("*`").partition("`")[0] for row in rows] == ["follower", "copy", "lqg", "balance"]
-    assert rows[2][1:] == ["83/84", "83/83", "1.10/1.10", "8.0/18.0", "2.0/2.0"]
+    assert rows[2][1:] == ["83/84", "83/83", "8.0/18.0", "2.0/2.0", "1.020/1.020", "10.0/10.0"]
     assert rows[1][2] == "-"  # a track that was not flown
     assert "\npair, mass known|`balance` 83|`copy`, `lqg` 83|`balance` 83|`lqg` 84\n" in text
     assert "\npair, mass unknown|-|`lqg` 83|-|`lqg` 83\n" in text  # nothing learned has flown it

@@ -96,6 +96,21 @@ def crazyflies() -> Iterator[tuple[str, Numbers]]:
         yield row["follower"], [row["crashes"], row["rmse"], row["rmse, worst of 99 %"]]
 
 
+def twin() -> Iterator[tuple[str, Numbers]]:
+    found = measured("twin_hover")["rows"]
+    learned = {"2.1": "flight", "thrust-upgrade": "flight-upgrade", "brushless": "flight-brushless"}
+    for drone, case in dict.fromkeys((row["drone"], row["case"]) for row in found):
+        names = (learned[drone], "lqg", "lqg-calm", "lqg-world")
+        line = case if drone == "2.1" else f"{drone.replace('-', ' ')}, {case}"
+        yield line, [1e3 * one(found, drone=drone, case=case, follower=name)["rms"] for name in names]
+    for name in ("flight", "lqg", "lqg-calm", "lqg-world"):
+        own = one(found, drone="2.1", case="as delivered", follower=name)
+        numbers = [1e3 * own["largest"], 1e3 * own["sideways"], 1e3 * own["change"], own["touchdown"]]
+        yield name, numbers
+    assert not any(row["limit"] for row in found)
+    assert {row["end"] for row in found} == {"done"}
+
+
 def onboard() -> Iterator[tuple[str, Numbers]]:
     found = measured("onboard")["inference"]
     for name in ("universal", "balance", "flight"):
@@ -111,6 +126,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Training time ": ("results", algorithms),
     "Other trainers": ("gym", trainers),
     "Two Crazyflies": ("results", crazyflies),
+    "Two Crazyflies ": ("results", twin),
     "Cost and tests": ("onboard", onboard),
 }
 

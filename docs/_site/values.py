@@ -140,9 +140,8 @@ ten_minutes = {
     for name in ("team3", "team4", "team6")
 }
 
-# rms change of the follower's roll from step to step on the twin as delivered [rad]
-change = {
-    row["follower"]: row["change"]
+delivered = {
+    row["follower"]: row
     for row in results("twin_hover")["rows"]
     if (row["drone"], row["case"]) == ("2.1", "as delivered")
 }
@@ -169,7 +168,11 @@ NAMES: dict[str, Any] = {
     "lift": 8 * full / 9.81 / total_mass(rig),  # share of the weight that a battery of 3 V carries
     "ten_minutes": SimpleNamespace(**ten_minutes),
     "silent": [row for row in results("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"],
-    "twin": SimpleNamespace(calmer=round(change["flight"] / change["lqg"])),
+    "twin": SimpleNamespace(
+        nearer=delivered["flight"]["rms"] / delivered["lqg"]["rms"],
+        calmer=delivered["flight"]["change"] / delivered["lqg"]["change"],
+        crashes={row["follower"]: row["crashes"] for row in results("crazyflie")["flight"]},
+    ),
     "kept": {row["follower"]: row["kept"] * row["starts"] for row in results("crazyflie")["stand"]},
     "upload": len(weight_bytes(file.load_file(file.shipped_policy("flight")))),
 }

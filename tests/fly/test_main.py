@@ -50,7 +50,7 @@ REFUSALS = [
     ([TRANSPORT, *URIS, "--battery", "9"], "--battery must be 2.5 to 4.2"),
     ([TRANSPORT, *URIS, "--gains", "/no/such/gains.json"], "does not exist"),
     ([TRANSPORT, *URIS, "--thrust", "guess"], "invalid choice"),
-    ([], "POLICY.npz"),
+    ([], "FOLLOWER"),
 ]
 
 
