@@ -12,7 +12,7 @@ import numpy as np
 import optax
 
 from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase
-from mjxball.algorithms.recurrent import fresh_layers
+from mjxball.algorithms.recurrent import ESTIMATE, FAR, estimation_cost, fresh_estimate, fresh_layers
 from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.errors import InputError
@@ -22,7 +22,6 @@ from mjxball.scalar_form import scalar_form
 SMALL_RESPONSE = 1e-3  # response to a unit impulse, in deviations of observations and in actions, that is negligible
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
 IMPULSE_RESPONSE_FROM = 0.75  # share of the gradient steps after which the impulse response counts
-FINE_ESTIMATE = 20.0  # an estimated number of deviation 1 is also estimated as the tanh of this multiple
 LEAST_DEVIATION = 0.02  # of an observation, so that one which hardly moves in the first window is not amplified
 
 
@@ -38,9 +37,6 @@ def _unbatched(value: Array) -> Array:
 @_unbatched.def_vmap
 def _unbatched_rule(count: int, batched: Any, value: Array) -> tuple[Array, bool]:
     return (value[0] if batched[0] else value), False
-
-
-ESTIMATE = "estimate"  # layer that estimates what critics alone observe from a GRU's state
 
 
 class GradientState(NamedTuple):
@@ -118,8 +114,7 @@ class FirstOrderGradient:
         inputs = self._slots.start if self._units else self._sizes[0]
         layers = fresh_layers(key, inputs, self._units, self._sizes[1:])
         if self._estimates:
-            shape = self._units, 2 * self._estimated
-            layers[ESTIMATE] = {"kernel": jnp.zeros(shape), "bias": jnp.zeros(shape[1])}
+            layers[ESTIMATE] = fresh_estimate(self._units, self._estimated)
         zero, zeros = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
         return GradientState(layers, self._adam.init(layers), slope, zero, zeros, zeros, zero, jnp.zeros((), jnp.int32))
@@ -232,11 +227,9 @@ class FirstOrderGradient:
 
     def _estimation_cost(self, layers: Any, policy: PolicyNetwork, seen: Array, hidden: Array) -> Array:
         """(envs,) cost of how far the estimates from a GRU's state `hidden` are from what critics alone observe."""
-        known, estimate = slice(self._slots.stop, None), layers[ESTIMATE]
-        true = jax.lax.stop_gradient((seen[..., known] - policy.mean[known]) / policy.deviation[known])
-        true = jnp.concatenate([true, jnp.tanh(FINE_ESTIMATE * true)], axis=-1)
-        wrong = hidden @ estimate["kernel"] + estimate["bias"] - true
-        return self._config.estimation * (wrong**2).mean(axis=-1)
+        known = slice(self._slots.stop, None)
+        true = (seen[..., known] - policy.mean[known]) / policy.deviation[known]
+        return self._config.estimation * estimation_cost(layers[ESTIMATE], hidden, jnp.clip(true, -FAR, FAR))
 
     def _advance_response(
         self, policy: PolicyNetwork, envs: Any, response: list[Array], impulse: Array

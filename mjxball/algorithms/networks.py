@@ -41,7 +41,10 @@ def make_networks(
         observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
     )
     if recurrent_slots is not None:
-        policy: Any = RecurrentPolicy(recurrent_slots, (*config.policy_layers, distribution.param_size), mask)
+        weight: Any = config.estimation  # a traced array in a sweep
+        estimates = not (isinstance(weight, (int, float)) and weight == 0)
+        sizes = *config.policy_layers, distribution.param_size
+        policy: Any = RecurrentPolicy(recurrent_slots, sizes, mask, estimates)
     else:
         policy = brax.networks.make_policy_network(
             distribution.param_size,

@@ -14,6 +14,9 @@ from mjxball.arrays import Array
 
 SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # initial time constants of a GRU's units [control steps]
 RECURRENT_GAIN = 0.7  # gain of a GRU's initial, orthogonal recurrent weights
+ESTIMATE = "estimate"  # layer that estimates what critics alone observe from a GRU's state; not exported
+FAR = 5.0  # deviations beyond which an estimated number is cut: one of a world that diverges would outweigh all others
+FINE_ESTIMATE = 20.0  # an estimated number of deviation 1 is also estimated as the tanh of this multiple
 
 
 def fresh_layers(key: Array, inputs: int, units: int, sizes: Sequence[int]) -> dict[str, Any]:
@@ -50,12 +53,27 @@ def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
     }
 
 
+def fresh_estimate(units: int, known: int) -> dict[str, Array]:
+    """Initial layer of the estimates of `known` numbers and of their fine form."""
+    return {"kernel": jnp.zeros((units, 2 * known)), "bias": jnp.zeros(2 * known)}
+
+
+def estimation_cost(layer: dict[str, Array], memory: Array, known: Array) -> Array:
+    """(...) mean squared error of the linear estimates from a GRU's state `memory` (..., H).
+
+    `known` (..., k) are the true numbers, each less its mean and over its deviation; no gradient passes through them.
+    """
+    true = jax.lax.stop_gradient(jnp.concatenate([known, jnp.tanh(FINE_ESTIMATE * known)], axis=-1))
+    return ((memory @ layer["kernel"] + layer["bias"] - true) ** 2).mean(axis=-1)
+
+
 class RecurrentPolicy(NamedTuple):
     """Replacement of Brax's policy network (`init`, `apply`) for observations that contain the GRU's state."""
 
     slots: slice  # entries of an observation that hold the state; they follow the network's inputs
     sizes: tuple[int, ...]  # of all layers, see `fresh_layers`
     mask: Any  # (n,) 1 for entries of an observation that the policy uses, else 0
+    estimates: bool = False  # with a layer `ESTIMATE` of what follows the state in an observation
 
     @property
     def units(self) -> int:
@@ -64,19 +82,23 @@ class RecurrentPolicy(NamedTuple):
 
     def init(self, key: Array) -> Any:
         """Initial parameters."""
-        return {"params": fresh_layers(key, self.slots.start, self.units, self.sizes)}
+        layers = fresh_layers(key, self.slots.start, self.units, self.sizes)
+        if self.estimates:
+            layers[ESTIMATE] = fresh_estimate(self.units, len(self.mask) - self.slots.stop)
+        return {"params": layers}
 
     def step(self, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
         """(parameters of the action's distribution (..., 2 a), next state (..., H)) at `observation` (..., n)."""
-        network = PolicyNetwork(policy["params"], statistics.mean, statistics.std, jnp.asarray(self.mask, jnp.float32))
+        layers = {name: layer for name, layer in policy["params"].items() if name != ESTIMATE}
+        network = PolicyNetwork(layers, statistics.mean, statistics.std, jnp.asarray(self.mask, jnp.float32))
         return network.outputs(observation)
 
     def apply(self, statistics: Any, policy: Any, observation: Array) -> Array:
         """Parameters of the action's distribution (..., 2 a), from the state in each `observation` (..., n)."""
         return self.step(statistics, policy, observation)[0]
 
-    def unroll(self, statistics: Any, policy: Any, observations: Array) -> Array:
-        """Parameters of the action's distribution (T, B, 2 a) along sequences of `observations` (T, B, n).
+    def unroll(self, statistics: Any, policy: Any, observations: Array) -> tuple[Array, Array]:
+        """(parameters of the action's distribution (T, B, 2 a), next states (T, B, H)) along `observations` (T, B, n).
 
         Only the first stored state of a sequence is used. The following states are computed with `policy`, so that
         gradients flow back through them. A stored state of zeros marks the start of an episode and resets the state.
@@ -88,9 +110,15 @@ class RecurrentPolicy(NamedTuple):
             state = jnp.where((stored_state == 0).all(axis=-1, keepdims=True), 0.0, state)
             parts = [observation[..., : self.slots.start], state, observation[..., self.slots.stop :]]
             parameters, state = self.step(statistics, policy, jnp.concatenate(parts, axis=-1))
-            return state, parameters
+            return state, (parameters, state)
 
         return jax.lax.scan(one, stored[0], (observations, stored))[1]
+
+    def estimation(self, statistics: Any, policy: Any, memory: Array, observations: Array) -> Array:
+        """() mean of `estimation_cost` for next states `memory` (T, B, H) at `observations` (T, B, n)."""
+        known = slice(self.slots.stop, None)
+        true = (observations[..., known] - statistics.mean[known]) / statistics.std[known]
+        return estimation_cost(policy["params"][ESTIMATE], memory, jnp.clip(true, -FAR, FAR)).mean()
 
 
 def answer(network: Any, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:

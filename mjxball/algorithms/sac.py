@@ -15,7 +15,7 @@ from jax import Array
 from mjxball.algorithms import replay
 from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase
 from mjxball.algorithms.networks import Networks, make_networks
-from mjxball.algorithms.recurrent import answer
+from mjxball.algorithms.recurrent import ESTIMATE, answer
 from mjxball.algorithms.replay import Replay, Transitions
 from mjxball.config import Config, Sac
 from mjxball.errors import InputError
@@ -116,12 +116,18 @@ def make_update(
         target = optax.incremental_update(critic, learner.target, config.tau)
         return learner._replace(critic=critic, critic_adam=adam, target=target), loss
 
-    def outputs(policy: Any, normaliser: Any, seen: Float[Array, "... n"]) -> Float[Array, "batch parameters"]:
-        """Distribution parameters at `seen`, observations (batch, n) or sequences of them (steps, sequences, n)."""
+    def outputs(policy: Any, normaliser: Any, seen: Float[Array, "... n"]) -> tuple[Array, Array]:
+        """(distribution parameters (batch, 2 a), cost () of estimates) at `seen`.
+
+        `seen` are observations (batch, n) or sequences of them (steps, sequences, n).
+        """
+        network, cost = networks.policy_network, jnp.zeros(())
         if seen.ndim == 2:
-            return networks.policy_network.apply(normaliser, policy, seen)
-        parameters = networks.policy_network.unroll(normaliser, policy, seen)
-        return parameters.reshape(-1, parameters.shape[-1])
+            return network.apply(normaliser, policy, seen), cost
+        parameters, memory = network.unroll(normaliser, policy, seen)
+        if network.estimates:
+            cost = config.estimation * network.estimation(normaliser, policy, memory, seen)
+        return parameters.reshape(-1, parameters.shape[-1]), cost
 
     def policy_step(
         before: Learner,
@@ -132,12 +138,12 @@ def make_update(
         rate: Float[Array, ""],
     ) -> tuple[Learner, Losses]:
         """Step of policy and temperature. It uses the critic `before` this batch's critic step, as Brax does."""
-        output, back = jax.vjp(lambda policy: outputs(policy, before.normaliser, seen), before.policy)
+        (output, _), back = jax.vjp(lambda policy: outputs(policy, before.normaliser, seen), before.policy)
         batch = batch._replace(observation=seen.reshape(-1, seen.shape[-1]))
         action = distribution.sample_no_postprocessing(output, noise)
         alpha, entropy = jnp.exp(before.log_alpha), -mean(jnp.mean(distribution.log_prob(output, action)))
         value, slope = jax.value_and_grad(policy_loss)(output, before.normaliser, before.critic, alpha, batch, noise)
-        (gradient,) = back(slope)
+        (gradient,) = back((slope, jnp.ones(())))
         learning_rate = rate * config.learning_rate
         policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, learning_rate)
         # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
@@ -339,7 +345,8 @@ class SoftActorCritic:
         """The running average of the policy, with its normalisation."""
         learner = state.learner
         mask = jnp.asarray(self._mask, jnp.float32)
-        return PolicyNetwork(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
+        layers = {name: layer for name, layer in learner.average["params"].items() if name != ESTIMATE}
+        return PolicyNetwork(layers, learner.normaliser.mean, learner.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> SacState:
         """The replay's rows are cut by environments, the rest is whole."""

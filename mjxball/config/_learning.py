@@ -25,6 +25,13 @@ class Sac:
         low=1,
         high=100_000,
     )
+    estimation: float = setting(
+        0.0,
+        "weight of the squared error of a linear estimate, from a recurrent network's state, of what critics alone "
+        "observe (follower.privileged_critic), each over its deviation; trains the memory, and is not exported",
+        low=0,
+        high=1e6,
+    )
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1, high=100_000)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
     num_critics: int = setting(2, "Q networks; the smallest of their values is used", low=1, high=2)

@@ -220,6 +220,45 @@ def test_an_estimate_needs_a_memory_and_something_to_estimate(transport: Config)
     np.testing.assert_array_equal(begun.layers["estimate"]["kernel"], state.layers["estimate"]["kernel"])
 
 
+def test_sac_trains_its_memory_to_estimate(transport: Config) -> None:
+    """The cost by hand. An update trains layer and memory by it, and the policy has no such layer."""
+    steps, weight = 4, 0.3
+    environments, random = Environments(Telling(), 8, Shards()), np.random.default_rng(5)
+    own = {"num_envs": 8, "batch_size": 8, "recurrent_steps": steps, "policy_layers": (8,), "critic_layers": (8,)}
+    plain, estimating = (
+        SoftActorCritic(with_settings(transport, sac={**own, "estimation": size}), environments)
+        for size in (0.0, weight)
+    )
+    network = estimating.networks.policy_network
+    learner = estimating.init(jax.random.key(1)).learner
+    assert learner.policy["params"]["estimate"]["kernel"].shape == (UNITS, 2)
+    assert "estimate" not in plain.init(jax.random.key(1)).learner.policy["params"]
+    assert "estimate" not in estimating.policy(estimating.init(jax.random.key(1))).layers  # not exported
+    policy = jax.tree.map(lambda leaf: jnp.float32(random.normal(scale=0.5, size=leaf.shape)), learner.policy)
+    seen = jnp.float32(random.normal(size=(steps, 3, environments.observation_size)))
+    statistics = learner.normaliser.replace(mean=learner.normaliser.mean + 0.1, std=learner.normaliser.std + 1.0)
+    with jax.default_matmul_precision("highest"):
+        _, memory = network.unroll(statistics, policy, seen)
+        cost = network.estimation(statistics, policy, memory, seen)
+    true = (np.asarray(seen[..., -1:], float) - 0.1) / 2
+    layer = policy["params"]["estimate"]
+    wrong = np.asarray(memory, float) @ layer["kernel"] + layer["bias"] - np.concatenate([true, np.tanh(20 * true)], -1)
+    assert float(cost) == pytest.approx(float(np.square(wrong).mean()), rel=1e-5)
+
+    def moved(algorithm: SoftActorCritic) -> Any:
+        state = algorithm.init(jax.random.key(1))
+        envs, keys = environments.begin(environments.reset(jax.random.key(0))), jax.random.split(jax.random.key(2), 3)
+        collect = jax.jit(algorithm.collect)
+        for _ in range(8):
+            state, envs = collect(state, envs, keys, TRAIN)
+        state, _ = jax.jit(algorithm.update)(state, keys[:2], jnp.zeros(()), TRAIN)
+        return state.learner.policy["params"]
+
+    first, second = moved(plain), moved(estimating)
+    assert np.abs(second["estimate"]["kernel"]).max() > 0
+    assert np.abs(first["gru"]["kernel"] - second["gru"]["kernel"]).max() > 1e-3
+
+
 @pytest.mark.parametrize("share", [0.4, 1.0])
 def test_windows_begin_with_the_memory_of_another_environment(share: float, transport: Config) -> None:
     """Some rows, no row its own; nothing else of an observation changes, and nothing at all in an evaluation."""
@@ -369,9 +408,9 @@ def test_sequences_are_answered_as_their_steps_were(transport: Config) -> None:
     sequence = jnp.stack(seen)
     assert (sequence[EPISODE, :, 2:] == 0).all()
     assert (sequence[1:EPISODE, :, 2:] != 0).any(axis=-1).all()
-    np.testing.assert_allclose(network.unroll(statistics, policy, sequence), jnp.stack(found), atol=1e-6)
+    np.testing.assert_allclose(network.unroll(statistics, policy, sequence)[0], jnp.stack(found), atol=1e-6)
     spoilt = sequence.at[3:EPISODE, :, 2:].set(0.3)
-    np.testing.assert_allclose(network.unroll(statistics, policy, spoilt), jnp.stack(found), atol=1e-6)
+    np.testing.assert_allclose(network.unroll(statistics, policy, spoilt)[0], jnp.stack(found), atol=1e-6)
 
 
 def test_batches_hold_whole_sequences(transport: Config, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
