@@ -65,7 +65,8 @@ class ProximalPolicyOptimization:
             parameters = self.networks.parametric_action_distribution.param_size
             policy = RecurrentPolicy(slots, (*ppo.policy_layers, parameters), self._mask)
             self.networks = self.networks.replace(policy_network=policy)
-            self._of_unrolls = self.networks.replace(policy_network=SimpleNamespace(apply=lambda *given: policy.unroll(*given)[0]))
+            outputs = SimpleNamespace(apply=lambda *given: policy.unroll(*given)[0])
+            self._of_unrolls = self.networks.replace(policy_network=outputs)
 
     def init(self, key: Array) -> PpoState:
         """Initial networks and a rollout of zeros."""
