@@ -31,7 +31,7 @@ class RewardInputs(NamedTuple):
     leader_command: Vector  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Vector  # the same for the follower
     tilt_disagreement: Scalar  # follower's minus leader's command about the axis without CG torque [rad]
-    spread: Vector | None  # follower's command minus the mean over followers [rad, m/s2], None with one follower
+    spread: Vector | None  # what of a follower's command moves nothing [rad, m/s2], None with one follower
     ball: Float[Array, "... directions"]  # offset of a rolling ball along the load's directions, over the end stop's
     rotors: Float[Array, "... rotors"] | None  # forces of all rotors over their largest, None if no weight needs them
     terminated: Bool[Array, "..."]  # whether the episode ended by leaving the termination distance or by diverging
