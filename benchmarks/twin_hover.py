@@ -21,6 +21,7 @@ from harness import Row, arguments, say, table, write
 from mjxball.control.crazyflie import FULL
 from mjxball.policy import policy_path
 from mjxball.running import run_command
+from mjxfly.classical import NAMES as CLASSICAL
 from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings
 from mjxfly.policy_setup import drone_of, goal_of, load_follower
@@ -44,7 +45,6 @@ DRONES = (
     ("thrust-upgrade", "crazyflie-thrust-upgrade", "flight-upgrade"),
     ("brushless", "crazyflie-brushless", "flight-brushless"),
 )
-CLASSICAL = ("lqg", "lqg-calm", "lqg-world")
 WORST = ("rms", "largest", "sideways", "tilt", "limit", "change", "touchdown")
 
 
@@ -64,10 +64,8 @@ def flown(case: str, follower: str, plant: str | None, seed: int) -> Row:
     goal = np.array(goal_of(config)) + np.array([0.0, 0.0, world.rest])
     errors = np.array([np.linalg.norm(moment.position - goal) for moment in late])
     early = np.array([moment.position[:2] for moment in world.track if moment.time <= begun + SETTLED])
-    sent = [
-        record["sent"] for record in world.log.records if record["kind"] == "tick" and record["t"] > begun + SETTLED
-    ]
-    rolls = np.radians([[one.roll for one in both] for both in sent[: len(late)]])
+    ticks = [record for record in world.log.records if record["kind"] == "tick" and record["state"] == "fly"]
+    rolls = np.radians([record["sent"][1].roll for record in ticks if record["t"] > begun + SETTLED])
     pwm = np.array([moment.pwm for moment in late])
     return {
         "end": end if len(flying) * settings.period > SECONDS - 1 else "not all flown",
@@ -76,7 +74,7 @@ def flown(case: str, follower: str, plant: str | None, seed: int) -> Row:
         "sideways": float(np.hypot(*early.T).max()),  # [m]
         "tilt": float(max(moment.tilt for moment in late)),  # [rad]
         "limit": float((pwm >= FULL).mean(axis=0).max()),  # share of the time of the motor that is longest at one
-        "change": float(np.sqrt((np.diff(rolls[:, 1]) ** 2).mean())),  # of the follower's roll from step to step [rad]
+        "change": float(np.sqrt((np.diff(rolls) ** 2).mean())),  # of the follower's roll from step to step [rad]
         "touchdown": world.touchdown_speed(),  # [m/s]
     }
 

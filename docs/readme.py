@@ -37,12 +37,10 @@ TRAINED = {"sac": "**`sac`**: learned by SAC", "balance": "**`balance`**: learne
 LEARNED = sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz"))
 MINUTE = "transport-sac"  # what README trains
 COLUMNS = (
-    *(
-        "follower",
-        "success [%]",
-        "mass unknown [%]",
-        "error then, 90 % [mm]",
-    ),
+    "follower",
+    "success [%]",
+    "mass unknown [%]",
+    "late error, 90 % [mm]",
     "rotor at its limit [%]",
     "power over hover",
     "change of commands [mrad]",

@@ -12,11 +12,19 @@ import numpy as np
 import optax
 
 from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase
-from mjxball.algorithms.recurrent import ESTIMATE, FAR, estimation_cost, fresh_estimate, fresh_layers
+from mjxball.algorithms.recurrent import (
+    ESTIMATE,
+    estimates,
+    estimation_cost,
+    exported,
+    fresh_estimate,
+    fresh_layers,
+)
 from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
+from mjxball.rewards import used
 from mjxball.scalar_form import scalar_form
 
 SMALL_RESPONSE = 1e-3  # response to a unit impulse, in deviations of observations and in actions, that is negligible
@@ -93,18 +101,10 @@ class FirstOrderGradient:
         self._actions = environments.action_size - self._units
         self._sizes = (environments.observation_size, *settings.policy_layers, 2 * self._actions)
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
-        weight: Any = settings.impulse_response  # a traced array in a sweep
-        self._responds = not (isinstance(weight, (int, float)) and weight == 0)
-        weight = settings.estimation
+        self._responds = used(settings.impulse_response)
         self._estimated = self._sizes[0] - self._slots.stop  # numbers
-        self._estimates = not (isinstance(weight, (int, float)) and weight == 0)
-        if self._estimates and not (self._units and self._estimated):
-            raise InputError(
-                "gradient.estimation needs a recurrent network and something to estimate: "
-                "--follower.recurrent_units 48 --follower.privileged_critic true"
-            )
-        share: Any = settings.exchanged_memory
-        self._exchanges = not (isinstance(share, (int, float)) and share == 0)
+        self._estimates = estimates("gradient", settings.estimation, self._units, self._estimated)
+        self._exchanges = used(settings.exchanged_memory)
         if self._exchanges and not self._units:
             raise InputError("gradient.exchanged_memory needs a recurrent network: --follower.recurrent_units 48")
         self._responds_from = round(IMPULSE_RESPONSE_FROM * settings.gradient_steps)  # windows
@@ -229,7 +229,7 @@ class FirstOrderGradient:
         """(envs,) cost of how far the estimates from a GRU's state `hidden` are from what critics alone observe."""
         known = slice(self._slots.stop, None)
         true = (seen[..., known] - policy.mean[known]) / policy.deviation[known]
-        return self._config.estimation * estimation_cost(layers[ESTIMATE], hidden, jnp.clip(true, -FAR, FAR))
+        return self._config.estimation * estimation_cost(layers[ESTIMATE], hidden, true)
 
     def _advance_response(
         self, policy: PolicyNetwork, envs: Any, response: list[Array], impulse: Array
@@ -299,8 +299,7 @@ class FirstOrderGradient:
         xp = state.mean.__array_namespace__()  # NumPy when a policy file is written, so that nothing is compiled
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
-        layers = {name: layer for name, layer in state.layers.items() if name != ESTIMATE}
-        return PolicyNetwork(layers, state.mean, deviation, self._mask)
+        return PolicyNetwork(exported(state.layers), state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
         """No array of the state is cut by environments."""

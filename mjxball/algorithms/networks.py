@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjxball.algorithms.recurrent import RecurrentPolicy
+from mjxball.algorithms.recurrent import RecurrentPolicy, estimates
 from mjxball.config import Sac
 from mjxball.quiet import import_brax_training
 
@@ -40,11 +40,11 @@ def make_networks(
     value_network = brax.networks.make_value_network(
         observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
     )
+    slots = recurrent_slots or slice(observation_size, observation_size)
+    estimating = estimates("sac", config.estimation, slots.stop - slots.start, observation_size - slots.stop)
     if recurrent_slots is not None:
-        weight: Any = config.estimation  # a traced array in a sweep
-        estimates = not (isinstance(weight, (int, float)) and weight == 0)
         sizes = *config.policy_layers, distribution.param_size
-        policy: Any = RecurrentPolicy(recurrent_slots, sizes, mask, estimates)
+        policy: Any = RecurrentPolicy(recurrent_slots, sizes, mask, estimating)
     else:
         policy = brax.networks.make_policy_network(
             distribution.param_size,

@@ -11,6 +11,8 @@ import numpy as np
 
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.arrays import Array
+from mjxball.errors import InputError
+from mjxball.rewards import used
 
 SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # initial time constants of a GRU's units [control steps]
 RECURRENT_GAIN = 0.7  # gain of a GRU's initial, orthogonal recurrent weights
@@ -53,6 +55,24 @@ def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
     }
 
 
+def estimates(section: str, weight: Any, units: int, known: int) -> bool:
+    """Whether a memory of so many `units` is trained to estimate `known` numbers: the `weight` in `section` is not 0.
+
+    Raises InputError if there is no memory, or nothing to estimate.
+    """
+    if used(weight) and not (units and known):
+        raise InputError(
+            f"{section}.estimation needs a recurrent network and something to estimate: "
+            "--follower.recurrent_units 48 --follower.privileged_critic true"
+        )
+    return used(weight)
+
+
+def exported(layers: dict[str, Any]) -> dict[str, Any]:
+    """`layers` without the one that estimates."""
+    return {name: layer for name, layer in layers.items() if name != ESTIMATE}
+
+
 def fresh_estimate(units: int, known: int) -> dict[str, Array]:
     """Initial layer of the estimates of `known` numbers and of their fine form."""
     return {"kernel": jnp.zeros((units, 2 * known)), "bias": jnp.zeros(2 * known)}
@@ -61,9 +81,11 @@ def fresh_estimate(units: int, known: int) -> dict[str, Array]:
 def estimation_cost(layer: dict[str, Array], memory: Array, known: Array) -> Array:
     """(...) mean squared error of the linear estimates from a GRU's state `memory` (..., H).
 
-    `known` (..., k) are the true numbers, each less its mean and over its deviation; no gradient passes through them.
+    `known` (..., k) are the true numbers, each less its mean and over its deviation, and cut at `FAR`; no gradient
+    passes through them.
     """
-    true = jax.lax.stop_gradient(jnp.concatenate([known, jnp.tanh(FINE_ESTIMATE * known)], axis=-1))
+    known = jax.lax.stop_gradient(jnp.clip(known, -FAR, FAR))
+    true = jnp.concatenate([known, jnp.tanh(FINE_ESTIMATE * known)], axis=-1)
     return ((memory @ layer["kernel"] + layer["bias"] - true) ** 2).mean(axis=-1)
 
 
@@ -89,9 +111,8 @@ class RecurrentPolicy(NamedTuple):
 
     def step(self, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
         """(parameters of the action's distribution (..., 2 a), next state (..., H)) at `observation` (..., n)."""
-        layers = {name: layer for name, layer in policy["params"].items() if name != ESTIMATE}
-        network = PolicyNetwork(layers, statistics.mean, statistics.std, jnp.asarray(self.mask, jnp.float32))
-        return network.outputs(observation)
+        layers, mask = exported(policy["params"]), jnp.asarray(self.mask, jnp.float32)
+        return PolicyNetwork(layers, statistics.mean, statistics.std, mask).outputs(observation)
 
     def apply(self, statistics: Any, policy: Any, observation: Array) -> Array:
         """Parameters of the action's distribution (..., 2 a), from the state in each `observation` (..., n)."""
@@ -118,7 +139,7 @@ class RecurrentPolicy(NamedTuple):
         """() mean of `estimation_cost` for next states `memory` (T, B, H) at `observations` (T, B, n)."""
         known = slice(self.slots.stop, None)
         true = (observations[..., known] - statistics.mean[known]) / statistics.std[known]
-        return estimation_cost(policy["params"][ESTIMATE], memory, jnp.clip(true, -FAR, FAR)).mean()
+        return estimation_cost(policy["params"][ESTIMATE], memory, true).mean()
 
 
 def answer(network: Any, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:

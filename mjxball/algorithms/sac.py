@@ -15,7 +15,7 @@ from jax import Array
 from mjxball.algorithms import replay
 from mjxball.algorithms.base import EnvironmentBatch, PolicyNetwork, Schedule, TrainingPhase
 from mjxball.algorithms.networks import Networks, make_networks
-from mjxball.algorithms.recurrent import ESTIMATE, answer
+from mjxball.algorithms.recurrent import answer, exported
 from mjxball.algorithms.replay import Replay, Transitions
 from mjxball.config import Config, Sac
 from mjxball.errors import InputError
@@ -345,7 +345,7 @@ class SoftActorCritic:
         """The running average of the policy, with its normalisation."""
         learner = state.learner
         mask = jnp.asarray(self._mask, jnp.float32)
-        layers = {name: layer for name, layer in learner.average["params"].items() if name != ESTIMATE}
+        layers = exported(learner.average["params"])
         return PolicyNetwork(layers, learner.normaliser.mean, learner.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> SacState:

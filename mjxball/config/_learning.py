@@ -5,6 +5,11 @@ from dataclasses import dataclass
 
 from mjxball.config._leaf import setting
 
+ESTIMATION = (
+    "weight of the squared error of a linear estimate, from a recurrent network's state, of what critics alone observe "
+    "(follower.privileged_critic), each over its deviation; trains the memory, and is not exported"
+)
+
 
 @dataclass(frozen=True)
 class Sac:
@@ -25,13 +30,7 @@ class Sac:
         low=1,
         high=100_000,
     )
-    estimation: float = setting(
-        0.0,
-        "weight of the squared error of a linear estimate, from a recurrent network's state, of what critics alone "
-        "observe (follower.privileged_critic), each over its deviation; trains the memory, and is not exported",
-        low=0,
-        high=1e6,
-    )
+    estimation: float = setting(0.0, ESTIMATION, low=0, high=1e6)
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1, high=100_000)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
     num_critics: int = setting(2, "Q networks; the smallest of their values is used", low=1, high=2)
@@ -104,13 +103,7 @@ class Gradient:
         low=0,
         high=1e6,
     )
-    estimation: float = setting(
-        0.0,
-        "weight of the squared error of a linear estimate, from a recurrent network's state, of what critics alone "
-        "observe (follower.privileged_critic), each over its deviation; trains the memory, and is not exported",
-        low=0,
-        high=1e6,
-    )
+    estimation: float = setting(0.0, ESTIMATION, low=0, high=1e6)
     exchanged_memory: float = setting(
         0.0,
         "probability that a window begins with the recurrent state of another environment, so that a network learns to "

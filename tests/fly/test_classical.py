@@ -98,7 +98,10 @@ def test_without_scipy_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
         ClassicalFollower("lqg", config)
 
 
-def test_a_policy_flies_without_scipy() -> None:
+def test_a_policy_is_loaded_without_scipy() -> None:
     """The runner imports it for classical followers alone."""
-    line = "import mjxfly.main, sys; sys.exit('scipy' in sys.modules)"
+    load = "from mjxfly.policy_setup import load_follower; load_follower(shipped_policy('flight'))"
+    line = (
+        f"from mjxball.policy import shipped_policy; {load}; import mjxfly.main, sys; sys.exit('scipy' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", line], check=False).returncode == 0
