@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -55,7 +56,8 @@ def join(rendezvous: Rendezvous) -> None:
     """Connect to the other processes. Must precede every other use of JAX's devices.
 
     If they do not connect within `PATIENCE`, the process prints an error and exits with code 2, where JAX would abort.
-    JAX waits in a separate thread, because it blocks outside Python; the main thread still handles signals.
+    JAX waits in a separate thread, because it blocks outside Python. The main thread handles signals, and wakes now and
+    then for those that came to another thread or just before it began to wait.
     """
     import jax
 
@@ -81,7 +83,9 @@ def join(rendezvous: Rendezvous) -> None:
     waiting = threading.Thread(target=initialize, daemon=True)
     with warnings.catch_warnings(action="ignore"):  # the error message below replaces them
         waiting.start()
-        waiting.join(PATIENCE)
+        deadline = time.monotonic() + PATIENCE
+        while waiting.is_alive() and time.monotonic() < deadline:
+            waiting.join(0.1)
     if waiting.is_alive():
         warn(f"error: the processes did not come together {where} within {PATIENCE} s: each must reach process 0")
         os._exit(2)  # any other exit would abort while JAX's thread runs

@@ -261,6 +261,26 @@ def test_who_waits_for_the_others_listens_where_it_was_told_and_hears_signals() 
             child.kill()
 
 
+ELSEWHERE = """
+import signal, time, jax
+def initialize(*_, **named):
+    time.sleep(1.0)
+    signal.raise_signal(signal.SIGINT)
+    time.sleep(1e4)
+jax.distributed.initialize = initialize
+"""
+
+
+@pytest.mark.slow
+def test_who_waits_hears_a_signal_that_came_to_another_thread() -> None:
+    """The main thread's wait is not interrupted by it, nor by one that comes just before the wait."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    code = ELSEWHERE + MEET.format(place=place, process=0, patience=LIMIT)
+    run = subprocess.run([sys.executable, "-c", code], env=environment(), timeout=LIMIT / 4)
+    assert run.returncode == 130
+
+
 def test_where_process_0_listens(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the address that it is given, if it is one of this machine's: `192.0.2.1` is nobody's (RFC 5737)."""
     given: list[Any] = []
