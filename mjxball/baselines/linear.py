@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from mjxball.arrays import Array, matmul
-from mjxball.control.observation import OWN_STATE
+from mjxball.control.observation import OWN_STATE, repeats
 
 VELOCITIES, AT_REST = slice(6, OWN_STATE), 1e-6  # of an own state [m/s], [rad/s]; largest of a follower at rest
 
@@ -18,13 +18,12 @@ def times(matrix: Array, vector: Array) -> Array:
 
 
 def missed(observation: Array, last: Array) -> Array:
-    """(..., 1) whether a moving follower's own state in `observation` (..., 18) is exactly the `last` (..., 12).
+    """(..., 1) whether a moving follower's own state in `observation` (..., 18) repeats the `last` (..., 12).
 
-    No new measurement has come then, as in a gap. At rest the state is the same with a new one.
+    At rest the state is the same with a new measurement.
     """
-    xp, own = observation.__array_namespace__(), observation[..., :OWN_STATE]
-    moves = xp.any(xp.abs(own[..., VELOCITIES]) > AT_REST, axis=-1, keepdims=True)
-    return moves & xp.all(xp.equal(own, last), axis=-1, keepdims=True)
+    xp = observation.__array_namespace__()
+    return repeats(observation, last) & xp.any(xp.abs(observation[..., VELOCITIES]) > AT_REST, axis=-1, keepdims=True)
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -25,14 +25,14 @@ from scipy.linalg.lapack import dposv
 
 from mjxball.arrays import Array, clipped, joined
 from mjxball.baselines.hover_model import LIFT, MEASURED, STATES, TILT, TURN
-from mjxball.baselines.linear import times
+from mjxball.baselines.linear import missed, times
 from mjxball.baselines.lqg_tuning import Tuning
 from mjxball.baselines.mpc_design import NAME, PAIR, TEAM, Limits, MpcDesign, design, limits_of
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
-from mjxball.control.observation import mount_angles
+from mjxball.control.observation import OWN_STATE, mount_angles
 from mjxball.errors import InputError
 
 BLOCKS = (1, 1, 1, 2, 2, 3, 4, 6, 8, 10, 12)  # control steps for which a correction is held: 1 s
@@ -128,7 +128,9 @@ def limit_rows(own: MpcDesign, limits: Limits, carried: float) -> tuple[np.ndarr
 
 
 class Mpc:
-    """The controller as a follower; its state (..., n + 3 `delay`) is the filter's state and the newest commands.
+    """The controller as a follower.
+
+    Its state (..., n + 3 `delay` + 12) is that of the filter, the newest commands, and the own state as last measured.
 
     It reads the believed mass of the object. `solved` counts its programs.
     """
@@ -157,28 +159,30 @@ class Mpc:
         """See `Controller.start`."""
         measured, zero = self._seen(observation)[..., list(MEASURED)], 0.0 * observation[..., 0]
         known = [measured[..., place] for place in range(len(MEASURED))]
-        return joined(known + [zero] * (STATES - len(MEASURED) + 3 * self.delay))
+        estimated = joined(known + [zero] * (STATES - len(MEASURED) + 3 * self.delay))
+        return observation.__array_namespace__().concat([estimated, observation[..., :OWN_STATE]], axis=-1)
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
         """See `Controller.step`."""
         xp, dtype, mass = observation.__array_namespace__(), observation.dtype, privileged.believed_mass
-        observation = self._seen(observation)
         kind = xp.round(clipped(mass, 0.0, MASSES[-1]) / MASSES[1]).astype(int)
         own = MpcDesign(*(xp.asarray(part, dtype=dtype)[kind] for part in self._stacked))
         hover = (self._limits.own_mass + self._limits.load_share * mass) * self._gravity / 4.0
-        x, commands = self._estimate(own, state, observation), state[..., STATES:]
+        x, commands = self._estimate(own, state, observation), state[..., STATES:-OWN_STATE]
         now = x
         for late in range(self.delay):
             now = self._moved(own, now, commands[..., 3 * late : 3 * late + 3], hover)
         command = self._command(own, now, hover, kind)
         commands = xp.concat([commands, command], axis=-1)
         moved = self._moved(own, x, commands[..., :3], hover)
-        return xp.concat([moved, commands[..., 3:]], axis=-1), self._sent(command)
+        return xp.concat([moved, commands[..., 3:], observation[..., :OWN_STATE]], axis=-1), self._sent(command)
 
     def _estimate(self, own: MpcDesign, state: Array, observation: Array) -> Array:
         """The filter's state (..., n) corrected by `observation`, at the time of its measurements."""
         x = state[..., :STATES]
-        return x + times(own.gain, observation[..., list(MEASURED)] - times(own.measured, x))
+        surprise = self._seen(observation)[..., list(MEASURED)] - times(own.measured, x)
+        repeated = missed(observation, state[..., -OWN_STATE:])
+        return x + times(own.gain, observation.__array_namespace__().where(repeated, 0.0, surprise))
 
     def _seen(self, observation: Array) -> Array:
         """`observation` (..., 18) in body axes; for teams it comes in mount frames."""

@@ -95,6 +95,12 @@ def copy_command(
     return leader.pid_command(error, rate, zero, (kp, kd, 0.0), gravity, tilt_limit, vertical_limit)
 
 
+def repeats(observation: Array, last: Array) -> Array:
+    """(..., 1) whether the own state in `observation` (..., 18) is exactly the `last` (..., 12), as in a gap."""
+    xp = observation.__array_namespace__()
+    return xp.all(xp.equal(observation[..., :OWN_STATE], last), axis=-1, keepdims=True)
+
+
 def action_mask(load_axis_only: bool, cg_axis: str) -> tuple[float, float, float]:
     """1 for each action that a network commands, else 0: of roll and pitch perhaps only the one that the load turns."""
     return (1.0, 1.0, 1.0) if not load_axis_only else (float(cg_axis == "y"), float(cg_axis == "x"), 1.0)
@@ -167,9 +173,8 @@ class ObservationHistory(NamedTuple):
             parts += [average[..., :OBSERVATION_SIZE] - observation, average[..., OBSERVATION_SIZE:]]
         parts.append(memory[..., self.past_size - ACTION_SIZE * self.previous_action : self.past_size])
         if self.stale:
-            same = xp.equal(observation[..., :OWN_STATE], memory[..., self.past_size :])
             flag, fresh = xp.asarray(STALE, dtype=observation.dtype), xp.zeros_like(observation[..., :1])
-            parts.append(xp.where(xp.all(same, axis=-1, keepdims=True), flag, fresh))
+            parts.append(xp.where(repeats(observation, memory[..., self.past_size :]), flag, fresh))
         return xp.concat(parts, axis=-1)
 
     def mask(self, ignore_position: bool) -> list[float]:
