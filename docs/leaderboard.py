@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from mjxball.baselines import CONTROLLERS
 from mjxball.bench import CONDITIONS
 from mjxball.bench.checks import read_entry
 from mjxball.bench.entry import HEADS, cells
@@ -19,7 +21,13 @@ from mjxball.bench.tracks import TRACKS
 from mjxball.errors import InputError
 from mjxball.running import run_command
 
-ENTRIES = Path(__file__).parents[1] / "benchmarks" / "leaderboard"
+REPOSITORY = Path(__file__).parents[1]
+ENTRIES = REPOSITORY / "benchmarks" / "leaderboard"
+KINDS = {
+    "learned": sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz")),
+    "classical": sorted(CONTROLLERS),
+}
+COSTS = ("success %", "late mm", "limit %", "power", "change mrad")  # columns of the best of each kind
 COLUMNS = ["follower", "", *HEADS, "date, commit"]
 
 
@@ -48,8 +56,30 @@ def table(track: str) -> str:
     return "\n".join(lines)
 
 
+def best(names: Iterable[str], track: str, condition: str) -> tuple[float, list[dict[str, Any]]]:
+    """How often those of `names` succeed that do most often [%], and their entries; (-1, []) if none flew."""
+    flown = [entry for entry in entries() if entry["follower"] in names and track in entry["tracks"]]
+    found = [entry["tracks"][track][condition] for entry in flown]
+    shares = [100 * one["succeeded"] / one["flights"] for one in found]
+    most = max(shares, default=-1.0)
+    return most, [entry for entry, share in zip(flown, shares, strict=True) if share == most]
+
+
+def bests() -> str:
+    """The best learned and the best classical follower of each track and condition, and what they cost to fly."""
+    lines = [f"| track | | | follower | {' | '.join(COSTS)} |", f"|{'---|' * (4 + len(COSTS))}"]
+    for track, own in TRACKS.items():
+        for condition in CONDITIONS:
+            for kind, names in KINDS.items():
+                for entry in best(names, track, condition)[1]:
+                    found = dict(zip(HEADS, cells(entry["tracks"][track][condition]), strict=True))
+                    shown = " | ".join(found[head] for head in COSTS)
+                    lines.append(f"| {own.title} | {condition} | {kind} | `{entry['follower']}` | {shown} |")
+    return "\n".join(lines)
+
+
 def __getattr__(name: str) -> Any:
-    """What the directive `generated` calls: the table of a track, whose name here has no hyphen."""
+    """What the directive `generated` calls for a track: its table. In the name `_` stands for a hyphen."""
     track = name.replace("_", "-")
     if track not in TRACKS:
         raise AttributeError(name)

@@ -24,9 +24,13 @@ from typing import Any
 
 import numpy as np
 
+import leaderboard
+from leaderboard import KINDS
 from mjxball import Policy, Scenario
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
+from mjxball.bench import CONDITIONS
+from mjxball.bench.tracks import TRACKS
 from mjxball.evaluate.paper_figures import plot_figure
 from mjxball.evaluate.plots import PANELS, plot_flights
 from mjxball.evaluate.results import fly_scenarios, scenario_title
@@ -141,6 +145,31 @@ def learning_curves(out: Path) -> None:
     save(figure, out / "learning-curves.svg")
 
 
+def best(out: Path) -> None:
+    """README: the best learned and the best classical follower of each track and condition."""
+    figure, panels = pyplot().subplots(1, 2, figsize=(8, 4.2), sharey=True, layout="constrained")
+    tracks = list(TRACKS)
+    for panel, condition in zip(panels, CONDITIONS, strict=True):
+        for place, (kind, look) in enumerate(series_styles(list(KINDS)).items()):
+            found = [leaderboard.best(KINDS[kind], track, condition) for track in tracks]
+            rows = np.arange(len(tracks)) + 0.4 * place - 0.2
+            panel.barh(rows, [max(share, 0.0) for share, _ in found], 0.36, color=look["color"], label=kind)
+            for row, (share, entries) in zip(rows, found, strict=True):
+                who = ", ".join(entry["follower"] for entry in entries) if entries else "not flown"
+                text, inside = f"{who} {share:.0f}" if entries else who, share > 50
+                panel.text(
+                    share + (-1.5 if inside else 1.5) if entries else 1.5,
+                    *(row, text),
+                    **{"ha": "right" if inside else "left", "va": "center", "fontsize": 9},
+                    **({"color": "white"} if inside else {}),
+                )
+        panel.set(xlim=(0, 100), xlabel="success [%]", title=condition)
+    panels[0].set_yticks(np.arange(len(tracks)), [TRACKS[track].title for track in tracks])
+    panels[0].invert_yaxis()
+    legend_above(figure, panels[:1])
+    save(figure, out / "best.svg")
+
+
 def viewer(out: Path) -> None:
     """Page view: `python -m mjxball.view balance`."""
     with tempfile.TemporaryDirectory() as place:
@@ -231,6 +260,7 @@ def screenshot(page: Path, path: Path, width: int = 1200, height: int = 800) -> 
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
+    "best": best,
     "copying": copying,
     "flight": flight,
     "crazyflie-stand": crazyflie_stand,
@@ -242,7 +272,8 @@ PICTURES: dict[str, Callable[[Path], None]] = {
 
 
 MADE = (
-    *("copying.svg", "flight.svg", "crazyflie-stand.svg", "crazyflie-gains.svg", "learning-curves.svg", "viewer.png"),
+    *(f"{name}.svg" for name in ("best", "copying", "flight", "crazyflie-stand", "crazyflie-gains", "learning-curves")),
+    "viewer.png",
     *(f"tutorial-{name}" for name in ("training.svg", "flight.svg", "report.png", "viewer.png", "rehearsal.svg")),
     *(f"tutorial-{name}.txt" for name in ("training", "results", "export", "rehearsal")),
 )

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from leaderboard import entries
-from mjxball.baselines import CONTROLLERS
+from leaderboard import KINDS, best, entries
 from mjxball.bench import CONDITIONS
 from mjxball.bench.entry import HEADS, cells
 from mjxball.bench.tracks import TRACKS as BENCH_TRACKS
@@ -34,7 +32,6 @@ CLASSICAL = {
     "lqg": "`lqg`",
 }
 TRAINED = {"sac": "**`sac`**: learned by SAC", "balance": "**`balance`**: learned by gradients"}
-LEARNED = sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz"))
 MINUTE = "transport-sac"  # what README trains
 COLUMNS = (
     "follower",
@@ -64,26 +61,12 @@ def row(text: str, tracks: Tracks) -> str:
     return " | ".join([text, *(shown(tracks, *column) for column in columns)])
 
 
-def best(found: dict[str, Tracks], names: Iterable[str], track: str, condition: str) -> tuple[float, str]:
-    """How often those of `names` succeed that do most often [%], and who they are; (-1, a dash) if none flew."""
-    flown = {name: found[name][track][condition] for name in names if track in found.get(name, {})}
-    share = {name: 100 * one["succeeded"] / one["flights"] for name, one in flown.items()}
-    most = max(share.values(), default=-1.0)
-    who = ", ".join(f"`{name}`" for name, value in share.items() if value == most)
-    return most, f"{who} {most:.0f}" if share else "-"
-
-
-def bests(found: dict[str, Tracks]) -> list[str]:
-    """A table of the best learned and the best classical follower on each track that was flown, and who leads."""
-    lines, wins = ["best [%]|calm: learned|classical|world: learned|classical", "|".join(["---"] * 5)], []
-    for name, track in BENCH_TRACKS.items():
-        cells = [[best(found, kind, name, one) for kind in (LEARNED, CONTROLLERS)] for one in CONDITIONS]
-        shares = [[share for share, _ in both] for both in cells]
-        if max(map(max, shares)) >= 0:
-            lines.append("|".join([track.title, *(text for both in cells for _, text in both)]))
-        wins += [classical > learned for learned, classical in shares if min(learned, classical) >= 0]
-    said = [f"Classical followers lead in {sum(wins)} of {len(wins)} cells."] if wins else []
-    return [*lines, "", *said]
+def leads() -> list[str]:
+    """In how many of the cells of the chart, `best.svg`, a classical follower is better."""
+    both = [[best(names, track, one)[0] for names in KINDS.values()] for track in BENCH_TRACKS for one in CONDITIONS]
+    flown = [shares for shares in both if min(shares) >= 0]
+    ahead = sum(classical > learned for learned, classical in flown)
+    return [f"Classical followers lead in {ahead} of {len(flown)} cells."] if flown else []
 
 
 def sentences(found: dict[str, Tracks]) -> list[str]:
@@ -101,7 +84,7 @@ def block() -> str:
     found = {entry["follower"]: entry["tracks"] for entry in entries()}
     rows = [row(text, found[name]) for name, text in (CLASSICAL | TRAINED).items() if name in found]
     table = [" | ".join(COLUMNS), "|".join(["---"] * len(COLUMNS)), *rows]
-    return "\n".join(["", *table, "", *bests(found), *sentences(found), "", ""])
+    return "\n".join(["", *table, "", *leads(), *sentences(found), "", ""])
 
 
 def main() -> int:

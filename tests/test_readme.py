@@ -22,6 +22,8 @@ sys.path.append(str(REPOSITORY / "docs"))
 from readme import BLOCK, block
 
 import leaderboard
+from mjxball.bench import CONDITIONS
+from mjxball.bench.tracks import TRACKS
 
 README = (REPOSITORY / "README.md").read_text()
 ROWS = re.findall(r"^(?!task)(\S.*?) \| `(.+?)` \| `?(\w+)`?.*$", README, flags=re.MULTILINE)
@@ -71,17 +73,37 @@ def test_the_block_has_a_row_for_every_entry_and_names_the_best(entered: Any) ->
     assert [row[0].strip("*`").partition("`")[0] for row in rows] == ["follower", "copy", "lqg", "balance"]
     assert rows[2][1:] == ["83/84", "83/83", "8.0/18.0", "2.0/2.0", "1.020/1.020", "10.0/10.0"]
     assert rows[1][2] == "-"  # a track that was not flown
-    assert "\npair, mass known|`balance` 83|`copy`, `lqg` 83|`balance` 83|`lqg` 84\n" in text
-    assert "\npair, mass unknown|-|`lqg` 83|-|`lqg` 83\n" in text  # nothing learned has flown it
     assert "\nClassical followers lead in 1 of 2 cells.\n" in text
-    assert len(text.splitlines()) == len(empty.splitlines()) + 6
-    assert "mass known|" not in empty
+    assert len(text.splitlines()) == len(empty.splitlines()) + 4
+    rows = [line.strip("| ").split(" | ") for line in leaderboard.bests().splitlines()[2:]]
+    assert [row[:5] for row in rows] == [
+        ["pair, mass known", "calm", "learned", "`balance`", "83"],
+        *(["pair, mass known", "calm", "classical", name, "83"] for name in ("`copy`", "`lqg`")),
+        ["pair, mass known", "world", "learned", "`balance`", "83"],
+        ["pair, mass known", "world", "classical", "`lqg`", "84"],
+        *(["pair, mass unknown", one, "classical", "`lqg`", "83"] for one in ("calm", "world")),  # flown by no other
+    ]
+    assert rows[0][5:] == ["8.0", "2.0", "1.020", "10.0"]
 
 
-def test_the_block_names_all_that_are_best(entered: Any) -> None:
+def test_the_chart_shows_the_best_of_the_leaderboard() -> None:
+    """Its picture is that of today's entries."""
+    chart = (REPOSITORY / "docs" / "best.svg").read_text()
+    shown = re.findall(r"<text [^>]*>([\w-]+(?:, [\w-]+)* \d+|not flown)</text>", chart)
+    expected = []
+    for condition in CONDITIONS:
+        for names in leaderboard.KINDS.values():
+            for track in TRACKS:
+                share, found = leaderboard.best(names, track, condition)
+                who = ", ".join(entry["follower"] for entry in found)
+                expected.append(f"{who} {share:.0f}" if found else "not flown")
+    assert shown == expected
+
+
+def test_the_block_says_what_the_first_training_is_worth(entered: Any) -> None:
     usual = {"pair": {"calm": results(), "world": results(late_error_90=0.018)}}
     text = entered(**dict.fromkeys(("pid", "lqg", "sac", "transport-sac"), usual))
-    assert "\npair, mass known|`sac` 83|`pid`, `lqg` 83|" in text
+    assert "\nClassical followers lead in 0 of 2 cells.\n" in text  # a draw
     assert "The training below succeeds in 83/83 %." in text
 
 
