@@ -98,8 +98,8 @@ def amplitudes_with_loss(config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Object masses (M,) [kg] and CG amplitudes (S, N, M) [m] that can be held in every direction without drone n.
 
     Masses span `scenario.object_mass`. Amplitudes are those of the linear program of `plant.trim` with
-    `scenario.trim_margin` and the leader at hover thrust. S counts `scenario.team_sizes`, or is 1 for the plant alone;
-    a ring's are divided by its size over the plant's. Negative: none, as without the leader. Needs SciPy.
+    `scenario.trim_margin` and the leader, if it flies, at hover thrust. S counts `scenario.team_sizes`, or is 1 for the
+    plant alone; a ring's are divided by its size over the plant's. Negative: none. Needs SciPy.
     """
     from mjxball.plant.trim import largest_amplitude
 
@@ -113,7 +113,7 @@ def amplitudes_with_loss(config: Config) -> tuple[np.ndarray, np.ndarray]:
     for row, count in enumerate(scenario.team_sizes or (most,)):
         plant = ring(config.plant, count) if scenario.team_sizes else config.plant
         wide = plant.object_size[0] / config.plant.object_size[0]
-        for number, (column, mass) in itertools.product(plant.followers, enumerate(masses)):
+        for number, (column, mass) in itertools.product(range(plant.count), enumerate(masses)):
             held = [
                 largest_amplitude(plant, mass * count / most, scenario.trim_margin, way, lost=(number,)) for way in ways
             ]
