@@ -150,7 +150,10 @@ def test_the_safe_radius_of_three_drones_is_the_linear_programs_own() -> None:
 def drawn() -> tuple[Config, Any, Any, Any]:
     """(config, load, plant, rig) of 400 worlds: rigs that differ, of which half of the largest lose a drone."""
     config = settings(
-        scenario__drone_mass_scale=(0.8, 1.2), scenario__mount_scale=(0.8, 1.2), scenario__lost_drone_probability=0.5
+        scenario__drone_mass_scale=(0.8, 1.2),
+        scenario__mount_scale=(0.8, 1.2),
+        scenario__lost_follower_probability=0.4,
+        scenario__lost_leader_probability=0.1,
     )
     sample = jax.jit(jax.vmap(ResetDistribution(config).sample))
     load, plant, _, rig = sample(jax.random.split(jax.random.key(0), 400), jnp.arange(400))

@@ -230,14 +230,14 @@ def _team() -> Config:
 
 
 def _lost() -> Config:
-    """Six drones of which one may fail; the followers hold most of the load by different lift."""
+    """Six drones of which one follower may fail; the followers hold most of the load by different lift."""
     team = _team()
     return replace(
         team,
         preset="lost",
         command=replace(team.command, vertical_limit=12.0),
         follower=replace(team.follower, action_scale_vertical=8.0),
-        scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_drone_probability=0.6),
+        scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_follower_probability=0.6),
         sac=replace(team.sac, num_envs=560, replay_size=560_000),
         ppo=Ppo(num_envs=560),
         gradient=replace(team.gradient, gradient_steps=900, num_envs=560, windows_per_episode=(6,)),

@@ -146,9 +146,10 @@ class ScenarioRanges:
         (1.0, 1.0), "factor on the carrier's mass and inertia, known to controllers", low=0.001, high=1000
     )
     attitude_gain_scale: Range = sampled((1.0, 1.0), "factor on all attitude gains", low=0.001, high=1000)
-    lost_drone_probability: float = setting(
-        0.0, "probability that the rotors of one drone stop, 3 to 15 s after the start", low=0, high=1
+    lost_follower_probability: float = setting(
+        0.0, "probability that the rotors of one follower stop, 3 to 15 s after the start", low=0, high=1
     )
+    lost_leader_probability: float = setting(0.0, "probability that those of the leader stop instead", low=0, high=1)
     mass_known: bool = setting(True, "hover thrust uses the true mass of the object, else the plant's nominal one")
     unknown_mass_probability: float = setting(
         0.0,

@@ -154,8 +154,11 @@ def _validate_team(config: Config) -> None:
         raise InputError("scenario.cg_width is for a load that moves in the plane: set plant.cg_axis to xy, or it to 0")
     if scenario.battery[1] > 0 and plant.count > 2:
         raise InputError("scenario.battery is for a pair of Crazyflies")
-    if scenario.lost_drone_probability > 0 and plant.count < 3:
-        raise InputError("scenario.lost_drone_probability needs a plant of three drones or more")
+    for name in ("lost_follower_probability", "lost_leader_probability"):
+        if getattr(scenario, name) > 0 and plant.count < 3:
+            raise InputError(f"scenario.{name} needs a plant of three drones or more")
+    if scenario.lost_follower_probability + scenario.lost_leader_probability > 1:
+        raise InputError("scenario.lost_follower_probability and scenario.lost_leader_probability exceed 1 together")
     if config.follower.load_axis_only and len(plant.directions) == 2:
         raise InputError("follower.load_axis_only is for a load that moves along a line, not in the plane")
     if config.rigs.number and not scenario.team_sizes:

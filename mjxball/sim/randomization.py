@@ -79,7 +79,8 @@ class ResetDistribution:
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
         self._lever = 2 * min(map(abs, constants.mounts[:, plant.directions[0]]))
         self._integrates = config.follower.residual_on_pid and config.leader.tilt_integral_gain > 0
-        self._loss_amplitudes = teams.amplitudes_with_loss(config) if scenario.lost_drone_probability > 0 else None
+        self._loses = scenario.lost_follower_probability + scenario.lost_leader_probability > 0
+        self._loss_amplitudes = teams.amplitudes_with_loss(config) if self._loses else None
         self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
@@ -138,7 +139,7 @@ class ResetDistribution:
             load = self._with_plane_path(load, jax.random.fold_in(rng, 12), rig)
         else:
             load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, jnp.maximum(self.trimmed(load, rig), 0.0)))
-        if scenario.lost_drone_probability > 0:
+        if self._loses:
             load = self._with_loss(load, jax.random.fold_in(rng, 8), rig)
         plant = start_state(
             self.config,
@@ -325,17 +326,20 @@ class ResetDistribution:
 
         No rotor stops if no CG could be trimmed afterwards, unless `trim_margin` is negative; then the CG stays at O.
         """
-        count, scenario = self.config.plant.count, self.config.scenario
+        plant, scenario = self.config.plant, self.config.scenario
         masses, table = self._loss_amplitudes  # type: ignore[misc]
         lost, which, when = jax.random.uniform(key, (3,))
-        existing = count if rig is None else rig.flies.sum()
-        chosen = jnp.floor(which * existing).astype(jnp.int32)
+        followers = np.array(plant.followers)
+        existing = len(followers) if rig is None else rig.flies[followers].sum()
+        follower = jnp.asarray(followers)[jnp.floor(which * existing).astype(jnp.int32)]
+        chosen = jnp.where(lost < scenario.lost_leader_probability, plant.leader, follower)
         size = 0 if rig is None or self._rings is None else jnp.argmin(jnp.abs(self._sizes - rig.flies.sum()))
         share, wide = (1.0, 1.0) if rig is None else (rig.size_ratio, rig.proportion)
         held = jnp.interp(load.object_mass / share, masses, jnp.asarray(table)[size, chosen]) * wide
-        happens = (lost < scenario.lost_drone_probability) & ((held > 0) | (scenario.trim_margin < 0))
+        likely = scenario.lost_follower_probability + scenario.lost_leader_probability
+        happens = (lost < likely) & ((held > 0) | (scenario.trim_margin < 0))
         low, high = LOSS_TIME
-        stops = (jnp.arange(count) == chosen) & happens
+        stops = (jnp.arange(plant.count) == chosen) & happens
         return load._replace(
             stop_time=jnp.where(stops, low + (high - low) * when, jnp.inf),
             cg_amplitude=jnp.where(happens, jnp.clip(held, 0.0, load.cg_amplitude), load.cg_amplitude),
