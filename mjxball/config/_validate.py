@@ -157,6 +157,8 @@ def _validate_team(config: Config) -> None:
     for name in ("lost_follower_probability", "lost_leader_probability"):
         if getattr(scenario, name) > 0 and plant.count < 3:
             raise InputError(f"scenario.{name} needs a plant of three drones or more")
+        if getattr(scenario, name) > 0 and config.rigs.number:
+            raise InputError(f"scenario.{name} is for the plant and its rings, not for random rigs: set rigs.number 0")
     if scenario.lost_follower_probability + scenario.lost_leader_probability > 1:
         raise InputError("scenario.lost_follower_probability and scenario.lost_leader_probability exceed 1 together")
     if config.follower.load_axis_only and len(plant.directions) == 2:

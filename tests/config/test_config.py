@@ -196,6 +196,16 @@ class TestOverride:
         assert repr(text) in str(error.value)
 
 
+def test_drones_are_lost_of_teams_whose_trim_is_known_without_them() -> None:
+    for start, name, said in (
+        ("lost", "leader", "exceed 1 together"),
+        ("universal", "leader", "not for random rigs"),
+        ("paper", "follower", "three drones or more"),
+    ):
+        config = configs.replace(configs.preset(start), f"scenario.lost_{name}_probability", 0.5)
+        assert said in refusal(config)
+
+
 class TestValidate:
     @rows(
         ("path", "value"),
