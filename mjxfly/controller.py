@@ -8,7 +8,7 @@ import numpy as np
 
 from mjxball.control import rotations
 from mjxball.policy import Policy
-from mjxball.sim.controllers import Body, Controllers
+from mjxball.sim.controllers import Body, Controllers, relative_to_goal
 from mjxfly.classical import ClassicalFollower
 from mjxfly.policy_setup import config_of, mount_angle
 
@@ -41,9 +41,12 @@ class FlightController:
         """Integrals of both controllers, see `sim.controllers.Controllers`."""
         return self._integral
 
-    def step(self, state: Body, goal: np.ndarray) -> PairCommands:
-        """Commands at `state` for the `goal` (3,) of O [m]. Call it once per control period."""
-        observation = self._controllers.observe(state, goal)
+    def step(self, state: Body, goal: np.ndarray, goal_rate: np.ndarray | None = None) -> PairCommands:
+        """Commands at `state` for the `goal` (3,) of O [m], which moves with `goal_rate` (3,) [m/s] or rests.
+
+        Call it once per control period.
+        """
+        observation, state = self._controllers.observe(state, goal, goal_rate), relative_to_goal(state, goal_rate)
         leader = self._controllers.leader_command(state, goal, self._integral)
         command = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
         follower = self._controllers.follower_command(rotations.turned_about_z(command, self._angle), self._integral)

@@ -232,7 +232,7 @@ class Flight:
                 tilt = rotations.tilt_of_quaternion(seen.quaternion)
                 self.flown.update(self._now, self.elapsed, distance, tilt, (one, other))
             if self._commands is None or self._count % self._every == 0:
-                self._commands = self.controller.step(seen, self.goal(self._now))
+                self._commands = self.controller.step(seen, self.goal(self._now), self._goal_rate)
             commands = [own + self._probe() for own in (self._commands.leader, self._commands.follower)]
             mapped = [setpoints.to_setpoint(own, constants) for own, constants in zip(commands, self.maps, strict=True)]
         except (PacketError, ValueError, FloatingPointError) as error:
@@ -245,7 +245,7 @@ class Flight:
         return mapped, []
 
     def goal(self, now: float) -> np.ndarray:
-        """Goal of O (3,) at `now` [m]. While landing it sinks, to below the ground, since the pair lags behind it."""
+        """Goal of O (3,) at `now` [m]. While landing it sinks, to below the ground."""
         goal = self._monitor.origin + np.array(self.settings.goal)
         if self._probes:
             goal[2] = self._monitor.origin[2] + min(self.settings.goal[2], probe.HEIGHT)
@@ -253,6 +253,12 @@ class Flight:
             sunk = self.settings.times.land_speed * (now - self.supervisor.since)
             goal[2] = max(self._monitor.origin[2] + self._land_height - sunk, self._monitor.origin[2] - 1.0)
         return goal
+
+    @property
+    def _goal_rate(self) -> np.ndarray | None:
+        """Rate (3,) of the goal while it sinks [m/s]. A controller that does not know it takes the lag for a load."""
+        sinks = self.supervisor.state is FlightState.LAND
+        return np.array([0.0, 0.0, -self.settings.times.land_speed]) if sinks else None
 
     @property
     def carry(self) -> str:

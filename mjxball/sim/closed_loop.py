@@ -10,7 +10,7 @@ from mjxball.config import Config
 from mjxball.control.observation import OWN_STATE
 from mjxball.physics.engine import has_diverged
 from mjxball.physics.mounts import own_motion
-from mjxball.sim.controllers import Body, BodyState, Controllers
+from mjxball.sim.controllers import Body, Controllers, relative_to_goal
 from mjxball.sim.sensors import EXACT, SensorSettings
 
 if TYPE_CHECKING:
@@ -157,10 +157,7 @@ class ClosedLoop(Controllers):
         """
         if self._leader_measures:
             return self.body_from_observation(observation, goal.position)
-        plant = state.plant
-        if goal.rate is None:
-            return plant
-        return BodyState(plant.position, plant.velocity - goal.rate, plant.quaternion, plant.rates)
+        return relative_to_goal(state.plant, goal.rate)
 
 
 def _where(diverged: Bool[Array, "..."], old: Array, new: Array) -> Array:

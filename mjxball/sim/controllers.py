@@ -60,6 +60,13 @@ class Body(Protocol):
         """About the body axes [rad/s]."""
 
 
+def relative_to_goal(body: Body, goal_rate: Vector | None) -> Body:
+    """`body` with its velocity relative to a goal that moves with `goal_rate` (..., 3) [m/s]; None: it rests."""
+    if goal_rate is None:
+        return body
+    return BodyState(body.position, body.velocity - goal_rate, body.quaternion, body.rates)
+
+
 class Controllers:
     """Controllers of all drones for one configuration, on arrays of any batch shape and namespace.
 

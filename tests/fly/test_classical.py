@@ -65,6 +65,9 @@ def test_lqg_hovers_on_the_twin() -> None:
     errors = np.linalg.norm(late - np.array(goal) - [0.0, 0.0, world.rest], axis=1)
     assert errors.max() < 0.01
     assert world.touchdown_speed() < 0.4
+    # It goes down where it hovered, since it knows the rate of the goal.
+    down = np.array([moment.position for moment in world.track if moment.state == "land"])
+    assert np.abs(down[:, :2] - np.array(goal)[:2]).max() < 0.03
 
 
 def test_a_file_of_that_name_is_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -137,6 +137,10 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "history.start": (HISTORY.start, (SEEN,)),
     "history.next": (HISTORY.next, (MEMORY, SEEN, ACTION)),
     "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
+    "observation.repeats": (
+        lambda seen, last: seen * observation.repeats(seen, last),
+        (SEEN, SEEN[:, : observation.OWN_STATE] * (np.arange(WORLDS)[:, None] % 2)),
+    ),
     "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
     "network_interface.command": (
         lambda a, s: NetworkInterface(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s),
