@@ -29,6 +29,8 @@ class FlightController:
         config = config_of(policy.metadata)
         self.policy, self.config, self.period = policy, config, policy.control_period
         self._controllers, self._angle = Controllers(config), mount_angle(policy.metadata)
+        # Networks fly worse with an input that was constant in training: the error's rate plus the velocity.
+        self._knows_rates = isinstance(policy, ClassicalFollower) or config.scenario.goal_motion_probability > 0
         self.reset()
 
     def reset(self) -> None:
@@ -44,9 +46,11 @@ class FlightController:
     def step(self, state: Body, goal: np.ndarray, goal_rate: np.ndarray | None = None) -> PairCommands:
         """Commands at `state` for the `goal` (3,) of O [m], which moves with `goal_rate` (3,) [m/s] or rests.
 
+        A follower that was trained with goals at rest takes a goal that moves for one at rest, and so does its leader.
         Call it once per control period.
         """
-        observation, state = self._controllers.observe(state, goal, goal_rate), relative_to_goal(state, goal_rate)
+        rate = goal_rate if self._knows_rates else None
+        observation, state = self._controllers.observe(state, goal, rate), relative_to_goal(state, rate)
         leader = self._controllers.leader_command(state, goal, self._integral)
         command = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
         follower = self._controllers.follower_command(rotations.turned_about_z(command, self._angle), self._integral)

@@ -256,7 +256,7 @@ class Flight:
 
     @property
     def _goal_rate(self) -> np.ndarray | None:
-        """Rate (3,) of the goal while it sinks [m/s]. A controller that does not know it takes the lag for a load."""
+        """Rate (3,) of the goal while it sinks [m/s]; an LQG that does not know it takes the lag for a load."""
         sinks = self.supervisor.state is FlightState.LAND
         return np.array([0.0, 0.0, -self.settings.times.land_speed]) if sinks else None
 

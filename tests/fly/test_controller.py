@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -113,6 +114,19 @@ def test_forgetting_starts_anew() -> None:
     controller.reset()
     again = controller.step(state, np.ones(3))
     np.testing.assert_array_equal(first.follower, again.follower)
+
+
+@pytest.mark.parametrize(("moving", "rest"), [(0.0, 0.0), (0.25, 0.3)])
+def test_only_who_was_trained_with_goals_that_move_knows_their_rate(moving: float, rest: float) -> None:
+    contents = load_file(TRANSPORT)
+    metadata = copy.deepcopy(contents.metadata)
+    metadata["config"]["scenario"]["goal_motion_probability"] = moving
+    policy = Policy(dataclasses.replace(contents, metadata=metadata), "a")
+    state = object_state(drones(pilot_rig(contents), *np.zeros((4, 3))), pilot_rig(contents))
+    controller, rate = FlightController(policy), np.array([0.0, 0.0, -0.3])
+    alone, moved = controller.step(state, np.zeros(3)), controller.step(state, np.zeros(3), rate)
+    assert alone.observation[17] - moved.observation[17] == pytest.approx(rest)
+    assert (alone.leader[2] - moved.leader[2] > 0.1) == (rest > 0)
 
 
 def test_late_ticks_do_not_shift_the_later_ones(monkeypatch: pytest.MonkeyPatch) -> None:
