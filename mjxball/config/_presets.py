@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import types
 from dataclasses import replace
+from typing import Any
 
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._learning import Gradient, Ppo, Sac
@@ -106,6 +107,26 @@ RECURRENT_GRADIENT = Gradient(
 RECURRENT = Follower(previous_action=True, recurrent_units=64)
 
 
+# The world of mjxball-bench; delays beyond its range, so that its own are no ends.
+WORLD: dict[str, Any] = {
+    "noise": (0.5, 2.0),
+    "estimator_drift": (0.5, 1.5),
+    "offset": (1.0, 1.0),
+    "pose_lag": (0.0, 0.03),
+    "gap_rate": (0.0, 0.25),
+    "jitter": (0.0, 0.005),
+    "delay": (0.0, 0.075),
+    "thrust_scale": (0.95, 1.05),
+    "rotor_drag": (0.1, 0.5),
+    "wind": (0.0, 2.0),
+    "gust": (0.0, 0.1),
+    "floor_clearance": (0.06, 1.0),
+    "download": (0.0, 0.1),
+    "thrust_fade": (0.0, 0.001),
+    "calm_probability": 0.35,  # noise hides errors of millimetres
+}
+
+
 def _balance() -> Config:
     """One follower for known and unknown loads: a recurrent network trained by first-order gradients."""
     large = _large()
@@ -122,28 +143,14 @@ def _balance() -> Config:
         ),
         scenario=replace(
             large.scenario,
-            # The world of mjxball-bench; delays and attitude loops beyond its ranges, so that its own are no ends.
-            noise=(0.5, 2.0),
-            estimator_drift=(0.5, 1.5),
-            offset=(1.0, 1.0),
-            pose_lag=(0.0, 0.03),
-            gap_rate=(0.0, 0.25),
-            jitter=(0.0, 0.005),
-            rotor_drag=(0.1, 0.5),
-            wind=(0.0, 2.0),
-            gust=(0.0, 0.1),
-            floor_clearance=(0.06, 1.0),
-            download=(0.0, 0.1),
-            thrust_fade=(0.0, 0.001),
-            calm_probability=0.35,  # noise hides errors of millimetres
+            **WORLD,
             # Faster loads than documented, and loads beyond what one drone trims, as a margin.
             cg_speed=(0.2, 3.5),
             trim_margin=-0.15,
             unknown_mass_probability=0.4,
             unknown_mass=(0.1, 0.4),
-            delay=(0.0, 0.075),
+            # Beyond the ranges of mjxball-bench, so that its own are no ends.
             attitude_frequency=(6.0, 24.0),
-            thrust_scale=(0.95, 1.05),
             rotor_lag_scale=(0.7, 1.5),
             inertia_scale=(0.8, 1.2),
             cg_waypoint_probability=0.3,
@@ -229,21 +236,6 @@ def _team() -> Config:
     )
 
 
-def _lost() -> Config:
-    """Six drones of which one follower may fail; the followers hold most of the load by different lift."""
-    team = _team()
-    return replace(
-        team,
-        preset="lost",
-        command=replace(team.command, vertical_limit=12.0),
-        follower=replace(team.follower, action_scale_vertical=8.0),
-        scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_follower_probability=0.6),
-        sac=replace(team.sac, num_envs=560, replay_size=560_000),
-        ppo=Ppo(num_envs=560),
-        gradient=replace(team.gradient, gradient_steps=900, num_envs=560, windows_per_episode=(6,)),
-    )
-
-
 def _universal() -> Config:
     """One follower for teams of any drones and loads, which knows only where drones are mounted."""
     large = _large()
@@ -278,10 +270,41 @@ def _universal() -> Config:
     )
 
 
+def _lost() -> Config:
+    """One follower for rings of three to six drones in the world, of which any one may stop."""
+    universal = _universal()
+    return replace(
+        universal,
+        preset="lost",
+        follower=replace(universal.follower, stale=True),
+        scenario=replace(
+            universal.scenario,
+            **WORLD,
+            team_sizes=(3, 4, 5, 6),
+            object_mass=(0.3, 0.9),
+            lost_follower_probability=0.3,
+            lost_leader_probability=0.1,
+        ),
+        rigs=Rigs(),
+        reward=replace(universal.reward, command_change=40.0, rotor_limits=20.0),
+        sac=replace(universal.sac, num_envs=560, replay_size=560_000),
+        ppo=Ppo(num_envs=560),
+        # For two cores, from the weights of `universal`.
+        gradient=replace(
+            universal.gradient,
+            num_envs=112,
+            gradient_steps=1900,
+            learning_rate=3e-3,
+            gradient_decay=0.985,
+            exchanged_memory=0.25,
+        ),
+    )
+
+
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
     {
         made.preset: made
-        for made in (_transport(), _paper(), _balance(), _team(), _lost(), _universal(), stand(), flight())
+        for made in (_transport(), _paper(), _balance(), _team(), _universal(), _lost(), stand(), flight())
     }
 )
 

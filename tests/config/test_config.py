@@ -202,7 +202,7 @@ def test_drones_are_lost_of_teams_whose_trim_is_known_without_them() -> None:
         ("universal", "leader", "not for random rigs"),
         ("paper", "follower", "three drones or more"),
     ):
-        config = configs.replace(configs.preset(start), f"scenario.lost_{name}_probability", 0.5)
+        config = configs.replace(configs.preset(start), f"scenario.lost_{name}_probability", 0.9)
         assert said in refusal(config)
 
 

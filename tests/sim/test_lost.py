@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.config import preset
 from mjxball.sim.rollout import simulate_batch
@@ -20,7 +21,7 @@ def test_a_controller_that_knows_of_the_loss_makes_up_for_it() -> None:
     Undisturbed, what is left to it is the discrete time of commands: half a millimetre. A follower that knows nothing
     of the loss is lost, so that it is one that matters.
     """
-    config = preset("lost")
+    config = configs.replace(preset("lost"), "command.vertical_limit", 12.0)
     flight = Scenario(omega=1.0, amplitude=0.1, mass=0.6, path=CIRCLE, goal=(0.0, 0.0, 0.0), seconds=12.0)
     losses = [dataclasses.replace(flight, lost=((k, 3.0),)) for k in config.plant.followers]
     found = {}

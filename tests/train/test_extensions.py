@@ -17,7 +17,7 @@ from tables import weekly
 
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.commands.train import main
-from mjxball.config import Config, preset, with_plant
+from mjxball.config import Config, preset
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import load_file, load_network
@@ -125,7 +125,7 @@ def test_a_reward_of_the_users_own_replaces_ours() -> None:
 
 @pytest.mark.slow
 def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
-    config = with_plant(preset("lost"), "team6")
+    config = with_settings(preset("team"), scenario={"team_sizes": ()})
     for reward in (lambda _, action, after: -after.metrics["error"], lambda _, action, after: action[..., 0] - 1.0):
         env = make_env(Extensions(reward=reward), config, "newton-euler")
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
