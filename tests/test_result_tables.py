@@ -38,12 +38,13 @@ def minutes() -> Iterator[tuple[str, Numbers]]:
     for name, policy, plant in (
         *((name, name, "paper") for name in ("balance", "sac")),
         *((name, "universal", name) for name in ("pair", "team3", "team4", "team6")),
+        *((f"ring of {size}", "lost", f"ring of {size}") for size in (3, 6)),
     ):
         own = [row for row in found if (row["policy"], row["plant"]) == (policy, plant)]
         peak = max(row[f"{axis}_peak"] for row in own for axis in "xyz")
         spread = [row["command_spread"] for row in own if row["command_spread"] is not None]
         yield (
-            "`universal`, pair" if name == "pair" else name,
+            {"pair": "`universal`, pair", "ring of 3": "`lost`, ring of 3"}.get(name, name),
             [1e3 * peak, max(row["rotor_power"] for row in own), *([max(spread)] if spread else [])],
         )
 
@@ -55,6 +56,13 @@ def beyond() -> Iterator[tuple[str, Numbers]]:
         *own, oracle = (one(found, case=case, follower=name) for name in names)
         errors = [None if row["error"] is None else 1e3 * row["error"] for row in (*own, oracle)]
         yield case, [*errors[:-1], own[-1]["power"], 100 * own[-1]["rotor_limit_share"], errors[-1]]
+
+
+def lost() -> Iterator[tuple[str, Numbers]]:
+    for row in measured("lost")["rows"]:
+        shares = [100 * row[name] / row["flights"] for name in ("in_air", "below_peak")]
+        peaks = [None if row[name] is None else 1e3 * row[name] for name in ("peak", "whole_late_90")]
+        yield f"`{row['follower']}`, {row['condition']}", [*shares, *peaks]
 
 
 def training() -> Iterator[tuple[str, Numbers]]:
@@ -122,6 +130,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Stability": ("results", stability),
     "Ten minutes": ("results", minutes),
     "Beyond the tracks": ("results", beyond),
+    "A lost drone": ("results", lost),
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),
     "Other trainers": ("gym", trainers),
@@ -137,7 +146,8 @@ def test_a_table_is_that_of_its_file(section: str) -> None:
     text = (
         (REPOSITORY / "docs" / f"{page}.md").read_text().partition(f"## {section.strip()}\n")[2].partition("\n## ")[0]
     )
-    lines = [line.replace("**", "") for line in text.splitlines() if line.startswith("| ")]
+    rows = [line.replace("**", "").strip("|").split("|") for line in text.splitlines() if line.startswith("|")]
+    lines = [f"| {' | '.join(cell.strip() for cell in cells)} |" for cells in rows]
     for name, numbers in wanted():
         found = [line for line in lines if line.startswith((f"| {name}", f"| `{name}`"))]
         assert found, name
@@ -159,7 +169,7 @@ def agree(line: str, numbers: Numbers) -> bool:
     )
 
 
-@rows("policy", ("balance", "paper", "flight", "flight-upgrade", "flight-brushless", "stand", "universal"))
+@rows("policy", ("balance", "paper", "flight", "flight-upgrade", "flight-brushless", "stand", "universal", "lost"))
 def test_what_was_flown_for_ten_minutes(policy: str) -> None:
     """Every number of millimetres is the largest error in a flight of this policy."""
     text = (REPOSITORY / "docs" / "followers.md").read_text()
