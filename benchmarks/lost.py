@@ -96,8 +96,7 @@ def flown(name: str, parts: Sequence[Part]) -> Row:
         led += [one.lost[0][0] == part.config.plant.leader for one in part.flights]
     peak = np.array([error.max() for error in lost])
     late = latest(lost)
-    limit = parts[0].config.scenario.termination_distance
-    flies = peak <= limit
+    flies = np.isfinite(peak)
     return {
         "flights": len(peak),
         "in_air": int(flies.sum()),
@@ -107,7 +106,7 @@ def flown(name: str, parts: Sequence[Part]) -> Row:
         "peak_90": float(np.quantile(peak, 0.9, method="higher")),
         "late": float(np.median(late)),
         "late_90": float(np.quantile(late, 0.9, method="higher")),
-        "whole_in_air": int(sum(error.max() <= limit for error in whole)),
+        "whole_in_air": int(sum(np.isfinite(error.max()) for error in whole)),
         "whole_late_90": float(np.quantile(latest(whole), 0.9, method="higher")),
     }
 
@@ -123,9 +122,11 @@ def follower_of(name: str, config: Config) -> Follower:
 
 
 def errors(config: Config, follower: Follower, flights: Sequence[Scenario]) -> list[np.ndarray]:
-    """|e_o| [m] of each flight from the loss on, or from the earliest; infinite once diverged."""
+    """|e_o| [m] of each flight from the loss on, or from the earliest; infinite once it has crashed."""
     record = simulate_batch(config, [(follower, flights)], "newton-euler")
-    far = np.where(record.diverged, np.inf, np.linalg.norm(record.error, axis=-1))
+    far = np.linalg.norm(record.error, axis=-1)
+    crashed = np.logical_or.accumulate(record.diverged | (far > config.scenario.termination_distance), axis=0)
+    far = np.where(crashed, np.inf, far)
     begins = [one.lost[0][1] if one.lost else TIME[0] for one in flights]
     return [far[record.time >= begin, number] for number, begin in enumerate(begins)]
 
