@@ -82,8 +82,8 @@ def pushed(world: VirtualTwin, monkeypatch: pytest.MonkeyPatch, *vertical: float
     flight, turns = world.flight, itertools.cycle(vertical)
     step = flight.controller.step
 
-    def ask(state, goal):
-        command, asked = np.array([0.0, 0.0, next(turns)]), step(state, goal)
+    def ask(state, goal, goal_rate=None):
+        command, asked = np.array([0.0, 0.0, next(turns)]), step(state, goal, goal_rate)
         return asked._replace(leader=command, follower=command)
 
     monkeypatch.setattr(flight.controller, "step", ask)
