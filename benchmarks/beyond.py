@@ -9,17 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from harness import Row, arguments, say, write
+from harness import Row, arguments, follower_of, say, write
 from mjxball import running
 from mjxball.config import preset
 from mjxball.control.followers import Follower
-from mjxball.evaluate.followers import follower_factory
 from mjxball.evaluate.metrics import measure_batch
-from mjxball.evaluate.policies import load_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.goals import GoalMotion
 from mjxball.sim.rollout import simulate_batch
@@ -58,15 +55,10 @@ def main(given: Sequence[str] | None = None) -> int:
     for name in options.followers:
         for case, flights, begins in cases():
             rows.append({"follower": name.rpartition("/")[2].removesuffix(".npz"), "case": case})
-            rows[-1] |= flown(follower_of(name), flights, begins)
+            rows[-1] |= flown(follower_of(name, CONFIG), flights, begins)
             say(rows[-1])
     write(options.json, {"rows": rows})
     return 0
-
-
-def follower_of(name: str) -> Follower:
-    """A policy file's, or a baseline with privileged information too."""
-    return load_policy(Path(name), CONFIG) if name.endswith(".npz") else follower_factory(name, "follower")[1](CONFIG)
 
 
 def flown(follower: Follower, flights: Sequence[Scenario], begins: float) -> Row:

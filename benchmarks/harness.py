@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from mjxball import __version__, cli
+from mjxball.config import Config
+from mjxball.control.followers import Follower
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
@@ -61,6 +63,14 @@ def medians(rows: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str
     """Of every one of `names` the median over paired runs; a number that is missing is infinitely bad."""
     known = {name: [math.inf if row[name] is None else row[name] for row in rows] for name in names}
     return {name: statistics.median(values) for name, values in known.items()}
+
+
+def follower_of(name: str, config: Config) -> Follower:
+    """A policy file's, or a baseline with privileged information too."""
+    from mjxball.evaluate.followers import follower_factory
+    from mjxball.evaluate.policies import load_policy
+
+    return load_policy(Path(name), config) if name.endswith(".npz") else follower_factory(name, "follower")[1](config)
 
 
 def finite(value: Any) -> Any:

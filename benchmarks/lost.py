@@ -13,19 +13,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from harness import Row, arguments, say, write
+from harness import Row, arguments, follower_of, say, write
 from mjxball import running
 from mjxball.bench import CONDITIONS
 from mjxball.bench.tracks import DIRECTIONS, MARGIN, TRACKS
 from mjxball.config import Config
 from mjxball.control.followers import Follower
-from mjxball.evaluate.followers import follower_factory
-from mjxball.evaluate.policies import load_policy
 from mjxball.plant.trim import largest_amplitude
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
@@ -114,11 +111,6 @@ def flown(name: str, parts: Sequence[Part]) -> Row:
 def latest(flights: Sequence[np.ndarray]) -> np.ndarray:
     """The largest |e_o| in the last third of each flight [m]."""
     return np.array([error[-len(error) // 3 :].max() for error in flights])
-
-
-def follower_of(name: str, config: Config) -> Follower:
-    """A policy file's, or a baseline with privileged information too."""
-    return load_policy(Path(name), config) if name.endswith(".npz") else follower_factory(name, "follower")[1](config)
 
 
 def errors(config: Config, follower: Follower, flights: Sequence[Scenario]) -> list[np.ndarray]:
