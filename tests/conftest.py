@@ -10,11 +10,12 @@ import contextlib
 import dataclasses
 import fcntl
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import hypothesis
 import jax
@@ -70,7 +71,6 @@ def locked(place: Path, kind: int) -> Iterator[None]:
 
 
 ATTEMPTS = 3  # of a test that flies by the clock, on a machine that others may keep busy
-running: list[pytest.Item] = []  # the test that runs
 
 
 def by_the_clock(item: pytest.Item) -> bool:
@@ -115,21 +115,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(
         key=lambda item: (
             item.path not in clocked,
-            places.get(str(item.path.relative_to(TESTS).with_suffix("")), len(places)),
+            places.get(os.path.relpath(item.path.with_suffix(""), TESTS), len(places)),
         )
     )
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Note which test runs."""
-    running[:] = [item]
+TOO_SLOW = "this computer is too slow for a rehearsal"
 
 
-def too_busy(reason: str) -> None:
+def too_busy(reason: str) -> NoReturn:
     """The machine was too busy for this flight by the clock: try again; the last attempt skips the test."""
-    last = getattr(running[0], "execution_count", ATTEMPTS) >= ATTEMPTS
-    (pytest.skip if last else pytest.fail)(f"the machine was too busy: {reason}")
+    raise pytest.fail.Exception(f"{TOO_SLOW}: {reason}", pytrace=False)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Iterator[None]:
+    """A test by the clock that fails where a rehearsal said that the machine was too slow skips at its last attempt."""
+    report = yield
+    said = f"{call.excinfo.value}{report.capstderr}" if report.failed and by_the_clock(item) else ""
+    found = re.search(f"{TOO_SLOW}.*", said)
+    if found and getattr(item, "execution_count", ATTEMPTS) >= ATTEMPTS:
+        report.outcome, report.longrepr = "skipped", (str(item.path), item.location[1] or 0, f"Skipped: {found[0]}")
+    return report
 
 
 @pytest.hookimpl(wrapper=True)

@@ -213,8 +213,6 @@ def reaches(log: Path, state: str, process: subprocess.Popen) -> bool:
 
 def landed(flight: Ended) -> None:
     """The flight must have ended safely; a machine too busy to fly it, which rightly aborts, tries all again."""
-    if "this computer is too slow" in flight.err:
-        too_busy(flight.err)
     assert flight.err == ""
     assert flight.states()[-2:] == ["stop", "done"]
     assert not flight.ticks("done")[-1]["sent"].any()

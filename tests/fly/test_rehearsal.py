@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, environment
-from conftest import too_busy
+from conftest import TOO_SLOW, too_busy
 
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
@@ -32,7 +32,6 @@ pytestmark = pytest.mark.alone  # by the clock
 
 # On a machine that keeps time states are 10 ms old, ticks 0.07 - 0.5 ms late at p99.
 OLD, LATE = 25.0, 2.0  # [ms]
-TOO_SLOW = "this computer is too slow for a rehearsal"
 PLACE = re.compile(
     r"^twin: the object is at \((.+), (.+), (.+)\) m from where it stood, motors (on|off); ", re.MULTILINE
 )
@@ -78,8 +77,6 @@ def kept_up_with(flight: Ended) -> None:
     events = {event.split(":")[0] for record in read(flight.log) for event in record.get("events", [])}
     ages = [float(age) for age in re.findall(r"state age: (\d+) ms", flight.out)]
     late = [float(late) for late in re.findall(r"p99 ([\d.]+) ms", flight.out)]
-    if TOO_SLOW in flight.err:
-        too_busy(flight.err)
     if events & {"DEADLINES", "STALE", "REFUSED"} or max(ages, default=0) > OLD or max(late, default=0) > LATE:
         too_busy(f"{sorted(events)}, states {ages} ms old, ticks {late} ms late")
 
@@ -144,8 +141,6 @@ def test_runner_watchdog_and_twin_share_a_slower_clock(onboard: tuple[str, ...],
     process = started("flight", tmp_path / "slow.jsonl", "--slow", "3", *onboard)
     out, err = process.communicate(timeout=200)
     took = time.monotonic() - began
-    if TOO_SLOW in err:
-        too_busy(err)
     assert (process.returncode, err) == (0, ""), out
     ticks = [record for record in read(tmp_path / "slow.jsonl") if record["kind"] == "tick"]
     flown = [record["t"] for record in ticks if record["state"] == "fly"]
