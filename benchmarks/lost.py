@@ -5,7 +5,8 @@ drone stop at a random time. What nobody could hold is left out: the CG's farthe
 benchmark's margin by the drones left, in every direction, with the leader at hover thrust where it flies. A row has,
 for one follower and condition, the flights that stay in the air to the end, those of them whose |e_o| stays below
 `PEAK` after the loss, the median and the 90 % quantile of the largest |e_o| after it, and of that in the last third;
-then the same flights without a loss.
+of the flights that stay in the air the median power over that at the start, the mean time with a rotor at its limit and
+the median change of commands (as mjxball-bench has them); then the same flights without a loss.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from mjxball.bench import CONDITIONS
 from mjxball.bench.tracks import DIRECTIONS, MARGIN, TRACKS
 from mjxball.config import Config
 from mjxball.control.followers import Follower
+from mjxball.evaluate.metrics import Metrics, fly_and_measure
 from mjxball.plant.trim import largest_amplitude
-from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
 
 DRAW, SIZES, FLIGHTS = 31, (5, 6), 60  # of each size in each condition
@@ -86,14 +87,17 @@ def flown(name: str, parts: Sequence[Part]) -> Row:
     lost: list[np.ndarray] = []
     whole: list[np.ndarray] = []
     led: list[bool] = []
+    all_metrics: list[Metrics] = []
     for part in parts:
         follower = follower_of(name, part.config)
-        lost += errors(part.config, follower, part.flights)
-        whole += errors(part.config, follower, [replace(one, lost=()) for one in part.flights])
+        found, metrics = errors(part.config, follower, part.flights)
+        lost, all_metrics = lost + found, all_metrics + metrics
+        whole += errors(part.config, follower, [replace(one, lost=()) for one in part.flights])[0]
         led += [one.lost[0][0] == part.config.plant.leader for one in part.flights]
     peak = np.array([error.max() for error in lost])
     late = latest(lost)
     flies = np.isfinite(peak)
+    sound = [one for one, up in zip(all_metrics, flies, strict=True) if up]
     return {
         "flights": len(peak),
         "in_air": int(flies.sum()),
@@ -103,6 +107,9 @@ def flown(name: str, parts: Sequence[Part]) -> Row:
         "peak_90": float(np.quantile(peak, 0.9, method="higher")),
         "late": float(np.median(late)),
         "late_90": float(np.quantile(late, 0.9, method="higher")),
+        "rotor_power": float(np.median([one.rotor_power for one in sound])) if sound else None,
+        "rotor_limit_share": float(np.mean([one.rotor_limit_share for one in sound])) if sound else None,
+        "command_change": float(np.median([one.smoothness for one in sound])) if sound else None,
         "whole_in_air": int(sum(np.isfinite(error.max()) for error in whole)),
         "whole_late_90": float(np.quantile(latest(whole), 0.9, method="higher")),
     }
@@ -113,14 +120,14 @@ def latest(flights: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([error[-len(error) // 3 :].max() for error in flights])
 
 
-def errors(config: Config, follower: Follower, flights: Sequence[Scenario]) -> list[np.ndarray]:
-    """|e_o| [m] of each flight from the loss on, or from the earliest; infinite once it has crashed."""
-    record = simulate_batch(config, [(follower, flights)], "newton-euler")
+def errors(config: Config, follower: Follower, flights: Sequence[Scenario]) -> tuple[list[np.ndarray], list[Metrics]]:
+    """|e_o| [m] of each flight from the loss on, or from the earliest, infinite once it has crashed; its metrics."""
+    record, metrics = fly_and_measure(config, [(follower, flights)], "newton-euler")
     far = np.linalg.norm(record.error, axis=-1)
     crashed = np.logical_or.accumulate(record.diverged | (far > config.scenario.termination_distance), axis=0)
     far = np.where(crashed, np.inf, far)
     begins = [one.lost[0][1] if one.lost else TIME[0] for one in flights]
-    return [far[record.time >= begin, number] for number, begin in enumerate(begins)]
+    return [far[record.time >= begin, number] for number, begin in enumerate(begins)], metrics
 
 
 if __name__ == "__main__":
