@@ -29,7 +29,7 @@ from mjxball.scalar_form import scalar_form
 
 SMALL_RESPONSE = 1e-3  # response to a unit impulse, in deviations of observations and in actions, that is negligible
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
-IMPULSE_RESPONSE_FROM = 0.75  # share of the gradient steps after which the impulse response counts
+IMPULSE_RESPONSE_FROM = 0.75  # share of the training after which the impulse response counts
 LEAST_DEVIATION = 0.02  # of an observation, so that one which hardly moves in the first window is not amplified
 
 
@@ -58,6 +58,7 @@ class GradientState(NamedTuple):
     square: Array  # (n,) mean of their squares
     seen: Array  # () 1 once `mean` and `square` are known
     windows: Array  # () integer number of windows flown
+    progress: Array  # () share of the training that is done
 
 
 class FirstOrderGradient:
@@ -107,7 +108,6 @@ class FirstOrderGradient:
         self._exchanges = used(settings.exchanged_memory)
         if self._exchanges and not self._units:
             raise InputError("gradient.exchanged_memory needs a recurrent network: --follower.recurrent_units 48")
-        self._responds_from = round(IMPULSE_RESPONSE_FROM * settings.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
         """Initial state. The first policy outputs actions close to 0."""
@@ -117,7 +117,8 @@ class FirstOrderGradient:
             layers[ESTIMATE] = fresh_estimate(self._units, self._estimated)
         zero, zeros = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
-        return GradientState(layers, self._adam.init(layers), slope, zero, zeros, zeros, zero, jnp.zeros((), jnp.int32))
+        windows = jnp.zeros((), jnp.int32)
+        return GradientState(layers, self._adam.init(layers), slope, zero, zeros, zeros, zero, windows, zero)
 
     def start_from(self, state: GradientState, policy: PolicyFile) -> GradientState:
         """`state` with the network and normalisation of `policy`, as NumPy arrays.
@@ -167,10 +168,9 @@ class FirstOrderGradient:
         if self._responds:
             own_key = self._shards.own(jax.random.fold_in(keys[0], 1))
             impulse = jax.random.normal(own_key, (len(envs.states.obs), self._actions))
-            late = _unbatched(state.windows) >= self._responds_from
+            late = _unbatched(state.progress) >= IMPULSE_RESPONSE_FROM
             with_impulse, without = functools.partial(flown, impulse), functools.partial(flown, ())
-            found = jax.lax.cond(late, with_impulse, without) if self._responds_from else with_impulse()
-            (loss, (envs, mean, square)), (slope, *_) = found
+            (loss, (envs, mean, square)), (slope, *_) = jax.lax.cond(late, with_impulse, without)
         else:
             (loss, (envs, mean, square)), (slope, *_) = flown(())
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
@@ -184,6 +184,7 @@ class FirstOrderGradient:
             square=first * square + (1 - first) * state.square,
             seen=jnp.maximum(state.seen, first),
             windows=state.windows + 1,
+            progress=state.progress,
         )
         updated = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), updated, state)
         return updated, envs
@@ -292,6 +293,7 @@ class FirstOrderGradient:
             layers=jax.tree.map(lambda value, along: value - rate * along, state.layers, direction), adam=adam
         )
         moved = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, state)
+        moved = moved._replace(progress=jnp.where(phase.learning, progress, state.progress))
         return moved, dict(zip(self.metrics, (state.loss, norm), strict=True))
 
     def policy(self, state: GradientState) -> PolicyNetwork:

@@ -36,6 +36,7 @@ from mjxball.train.run_directory import (
 )
 from mjxball.xla import compile_small_loops_whole
 
+MOST_MINUTES = 1e5
 # Packages that a run imports only after it has begun, some after hours.
 LATE_IMPORTS = ("tensorboardX", "orbax.checkpoint", "mujoco", "scipy", "matplotlib", "jinja2")
 
@@ -54,6 +55,8 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
+    if options.minutes is not None:
+        _check_minutes(options)
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name) is not None}
     if extensions.get("algorithm") == "sac":  # the default, which needs no check
         del extensions["algorithm"]
@@ -71,6 +74,8 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
         "source_hash": source_hash(),
         "versions": versions(),
     }
+    if options.minutes is not None:
+        origin["minutes"] = options.minutes
     if options.start_from is not None:
         origin["start_from"] = _start_from(options, settings, members)
     if options.share is not None:
@@ -137,6 +142,15 @@ def _start(path: Path, settings: config.Config) -> dict[str, str]:
         layers = ",".join(map(str, sizes))
         raise InputError(f"{path} has hidden layers {layers}; say --gradient.policy_layers {layers}")
     return start
+
+
+def _check_minutes(options: argparse.Namespace) -> None:
+    """Raise InputError unless --minutes can be kept. What is meant to be the same everywhere goes by steps."""
+    if not 0 < options.minutes <= MOST_MINUTES:
+        raise InputError(f"--minutes must be above 0 and at most {MOST_MINUTES:g}, not {options.minutes:g}")
+    if options.distributed or options.share is not None:
+        other = "--distributed" if options.distributed else "--share"
+        raise InputError(f"--minutes goes by the clock of one process, and {other} by steps; drop one of them")
 
 
 def _digest(names: dict[str, str]) -> str | None:
@@ -217,7 +231,7 @@ def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
 def refuse_new_run_options(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
     """Raise InputError, which begins with `why`, for options of a new run other than `but`."""
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    names = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
+    names = ("out", "seed", "num_seeds", "minutes", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
     given += [f"--{name.replace('_', '-')}" for name in names if name not in but and getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:

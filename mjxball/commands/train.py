@@ -65,6 +65,8 @@ def parser() -> cli.Parser:
     about = "run directory (default runs/PRESET-<time>, with --env runs/CLASS-<time>)"
     run.add_argument("--out", type=Path, metavar="DIR", help=about)
     run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
+    about = "train for M minutes since the start of the command, in place of as many steps as the settings say"
+    run.add_argument("--minutes", type=float, metavar="M", help=about)
     about = "train K followers at once, seeds N, N + 1 ... (default 1)"
     run.add_argument("--num-seeds", "--seeds", type=int, metavar="K", help=about)
     run.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
@@ -165,7 +167,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
                     if writes and is_evaluated(origin):
                         pool.submit(compile_ahead, settings, origin["physics"])
 
-                code = _run(settings, origin, out, resume, prepare, options.tracker)
+                code = _run(settings, origin, out, resume, prepare, options.tracker, started)
             if rendezvous:
                 processes.leave()
         return _finish(settings, origin, out, code, started) if writes else code or 0
@@ -195,11 +197,12 @@ def _run(
     out: Path,
     resume: bool,
     on_start: Callable[[], None],
-    tracker: str | None = None,
+    tracker: str | None,
+    began: float,
 ) -> int | None:
     """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train.
 
-    `on_start` is called when everything is compiled and the device begins to train.
+    `on_start` is called when everything is compiled and the device begins to train. `began`: when the command did.
     """
     wake_devices()
     # The algorithm's libraries are imported while the devices start.
@@ -223,7 +226,7 @@ def _run(
         if steps >= total:
             return None
     try:
-        return 0 if loop.train(Run(settings, out, origin, state, start), on_start) else 130
+        return 0 if loop.train(Run(settings, out, origin, state, start, began), on_start) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             saved = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))

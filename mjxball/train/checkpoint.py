@@ -181,7 +181,8 @@ def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> tuple[Tr
             f"{run} was trained with every follower's worlds on {parts} device(s), not {population.parts}; "
             "continue it with as many processes as before"
         )
-    return _restore(run, population, discard=True), population.program.schedule.total_steps
+    state = _restore(run, population, discard=True)
+    return state, population.program.schedule.total_steps if state is None else population.total_steps(state)
 
 
 def _restore(run: Path, population: Population, discard: bool) -> TrainState | None:

@@ -38,6 +38,10 @@ def learn(run: Run, stop: Stop) -> bool:
     The host processes a chunk of training, a row of metrics.csv, while the devices work on the next one.
     """
     plan = Plan.of(run.population.program)
+    timed = run.seconds_left() is not None
+    if timed:  # the first collection tells how quick the devices are
+        done = max(run.done, plan.warmup)
+        plan = plan._replace(total=max(run.total, done + 2 * plan.window), chunk=plan.window, begin=done)
     waiting: Chunk | None = None  # submitted to the devices, row not written yet
     # Several processes must stop at the same step, which they agree on between chunks.
     pause = (lambda: stop.requested) if jax.process_count() == 1 else lambda: False
@@ -54,10 +58,14 @@ def learn(run: Run, stop: Stop) -> bool:
         # A signal may reach one process only: all act on what they agree on here.
         ended, late = processes.any_of((stop.requested, run.saved_long_ago()))
         evaluates = evaluates and waiting is not None
-        if waiting and (evaluates or late or ended):
+        if waiting and (evaluates or late or ended or timed):
             row = run.row(waiting)
             run.progress.show(row | run.evaluate() if evaluates else row)
             waiting = None
+            left = run.seconds_left()
+            if left is not None and goal < plan.total:
+                plan = plan.ending(run.done + left * row["rate"] / run.environments, run.done)
+                run.end_at(plan.total)
         if evaluates or late:
             run.save()
     return not ended
@@ -70,17 +78,23 @@ class Plan(NamedTuple):
     total: int  # all steps, including the warm-up
     chunk: int  # steps between two rows
     evaluations: int  # number of evaluations
+    window: int  # steps of a collection
+    begin: int = 0  # steps after which the first chunk begins
 
     @classmethod
     def of(cls, program: TrainingProgram) -> Plan:
         """The plan of a program's schedule."""
-        total, window = program.total_steps_each, program.algorithm.steps_per_collect
-        chunk = math.ceil(total / CHUNKS / window) * window
-        return cls(program.warmup_steps_each, total, chunk, program.schedule.num_evaluations)
+        evaluations, window = program.schedule.num_evaluations, program.algorithm.steps_per_collect
+        return cls(program.warmup_steps_each, 0, 0, evaluations, window).ending(program.total_steps_each)
+
+    def ending(self, total: float, done: int = 0) -> Plan:
+        """The plan with `total` steps in whole collections, one of them after `done` at least."""
+        collections = max(math.ceil((total - done) / self.window), 1)
+        chunk = math.ceil(total / CHUNKS / self.window) * self.window
+        return self._replace(total=done + collections * self.window, chunk=chunk, begin=done)
 
     def next(self, done: int) -> tuple[int, bool]:
         """(steps at the end of the chunk that contains step `done`, whether an evaluation follows it)."""
-        number, chunks = done // self.chunk + 1, math.ceil(self.total / self.chunk)
-        goal = min(number * self.chunk, self.total)
-        evaluates = number * self.evaluations // chunks > (number - 1) * self.evaluations // chunks
-        return goal, evaluates or goal >= self.total
+        before = done - (done - self.begin) % self.chunk
+        goal = min(before + self.chunk, self.total)
+        return goal, goal * self.evaluations // self.total > before * self.evaluations // self.total

@@ -84,7 +84,7 @@ class Population:
         whole: Any = PartitionSpec() if self._single else PartitionSpec("members")
         split: Any = PartitionSpec(*whole, "envs")
         self._whole, self._split = whole, split
-        self._state_spec = TrainState(self.program.algorithm.partition(whole, split), split, whole, whole)
+        self._state_spec = TrainState(self.program.algorithm.partition(whole, split), split, whole, whole, whole)
         self._statistics_spec = Statistics(whole, whole, whole, split)
 
     def member_config(self, member: int) -> Config:
@@ -209,6 +209,17 @@ class Population:
         ]
         learnt = started[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *started)
         return state._replace(algorithm=self.place(learnt, self._whole))
+
+    def ending_at(self, state: TrainState, total: int) -> TrainState:
+        """`state` of a training of `total` environment steps."""
+        return state._replace(total=self.place(np.full(state.total.shape, total, np.float32), self._whole))
+
+    def total_steps(self, state: TrainState) -> int:
+        """Environment steps of the whole training of `state`, which has them in float32."""
+        total, schedule = np.ravel(processes.gather(state.total))[0], self.program.schedule
+        if total == np.float32(schedule.total_steps):
+            return schedule.total_steps
+        return round(float(total) / schedule.num_envs) * schedule.num_envs
 
     def advance(
         self, compiled: Compiled, state: TrainState, mode: Mode, pause: Callable[[], bool] = lambda: False

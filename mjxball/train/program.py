@@ -60,6 +60,7 @@ class TrainState(NamedTuple):
     envs: Any  # brax State of all environments
     key: Array
     steps: Int[Array, ""]  # environment steps recorded
+    total: Float[Array, ""]  # of the whole training, by which learning rates fall
 
 
 class TrainingProgram:
@@ -98,7 +99,8 @@ class TrainingProgram:
     def begin(self, key: Array) -> TrainState:
         """Initial training state without environments."""
         learner_key, _, _, key = jax.random.split(key, 4)
-        return TrainState(algorithm=self.algorithm.init(learner_key), envs=(), key=key, steps=jnp.zeros((), jnp.int32))
+        learner, total = self.algorithm.init(learner_key), jnp.asarray(self.schedule.total_steps, jnp.float32)
+        return TrainState(learner, (), key, jnp.zeros((), jnp.int32), total)
 
     def episodes(self, key: Array, training: Bool[Array | np.ndarray, ""]) -> Any:
         """Initial states of all environments, of `create(key)` if `training`, else of every evaluation with `key`.
@@ -142,13 +144,13 @@ class TrainingProgram:
         taken = self.schedule.num_envs * algorithm.steps_per_collect
         steps = state.steps + jnp.where(phase.recording, taken, 0)
         collected = self.environments.over_shards(envs.statistics)
-        return TrainState(learnt, envs.states, keys[-1], steps), added(statistics, collected), keys
+        return TrainState(learnt, envs.states, keys[-1], steps, state.total), added(statistics, collected), keys
 
     def update(
         self, state: TrainState, keys: Array, phase: TrainingPhase
     ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """One update of the algorithm, with the `keys` of the preceding `collect`: (state, the algorithm's metrics)."""
-        progress = jnp.minimum(state.steps / self.schedule.total_steps, 1.0)
+        progress = jnp.minimum(state.steps / state.total, 1.0)
         update_keys = list(keys[self.algorithm.collect_keys : -1])
         with jax.default_matmul_precision(MATMUL_PRECISION):
             learnt, metrics = self.algorithm.update(state.algorithm, update_keys, progress, phase)

@@ -66,7 +66,7 @@ class Progress:
         tracker: Log | None = None,
     ):
         """`names`: see `columns`. `tracker` is called with every row."""
-        self._names, self._total, self._members = list(names), total, members
+        self._names, self.total, self._members = list(names), total, members
         session = session or Session()
         self._called = session.name
         self._status = Status(stream or sys.stderr)
@@ -139,15 +139,15 @@ class Progress:
             doing, what, keys = self._doing
             return [[f"{doing} {self.elapsed():.0f} s", *([what] if what else [])], [keys, self._called]]
         row, came = self._latest
-        steps = f"{row['steps']:,} of {self._total:,} steps"
+        steps = f"{row['steps']:,} of {self.total:,} steps"
         return [[*self._speed(row, time.monotonic() - came), steps, self._called], [KEYS, *self._summary(row)]]
 
     def _speed(self, row: Row, since: float) -> list[str]:
         """Share of the steps done, time left, and steps per second; `since` the row [s]."""
-        left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
+        left = max(self.total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
         minutes, seconds = divmod(max(int(left), 0), 60)
         return [
-            f"{min(row['steps'] / self._total, 1.0):.0%}",
+            f"{min(row['steps'] / self.total, 1.0):.0%}",
             f"{minutes}:{seconds:02d} left",
             f"{row['rate'] / 1e3:.1f} k/s",
         ]

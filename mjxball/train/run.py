@@ -8,6 +8,7 @@ import os
 import resource
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -105,11 +106,13 @@ class Run:
         origin: dict[str, Any],
         resumed: TrainState | None,
         tracker: Start | None = None,
+        began: float | None = None,
     ):
         """`resumed`: the state to continue from, None for a new run. `tracker`: see `mjxball.train.progress.Start`.
 
         `origin` holds seed, physics, seeds (number of members) and sweep, and goes into the metadata of the policy. A
         new run starts from the policy `origin["start_from"]` if there is one, or each member from its entry of a list.
+        With `origin["minutes"]` it takes as many steps as it can in that time since `began` (`time.monotonic`).
         """
         self.config, self.out = config, out
         self._starts = starts_of(origin)
@@ -130,9 +133,13 @@ class Run:
                 write_config(out, config, self.origin)
         exploring, evaluated = self.population.metric_names()
         names = columns(exploring, self.population.program.algorithm.metrics, evaluated)
-        place, total, seed, count = out / METRICS, self._schedule.total_steps, origin["seed"], origin["seeds"]
+        place, seed, count = out / METRICS, origin["seed"], origin["seeds"]
+        total = self._schedule.total_steps if resumed is None else self.population.total_steps(resumed)
         self.progress = Progress(place if self._writes else None, names, total, done, count, session=whole, tracker=log)
         sessions = [session(self.population.member_config(k), seed + k, 1, origin) for k in range(count)]
+        minutes: float | None = origin.get("minutes")
+        begun = time.monotonic() if began is None else began
+        self._ends = None if minutes is None else begun + 60 * minutes - self.progress.before
         self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
         self._clock = ThreadPoolExecutor(1)  # waits for the devices to take the time
@@ -209,6 +216,25 @@ class Run:
         ended = self._clock.submit(lambda: (jax.block_until_ready(statistics), self.progress.elapsed())[1])
         self._reached += taken * self._schedule.num_envs
         return Chunk(taken, self._reached, began, ended, statistics, metrics)
+
+    @property
+    def total(self) -> int:
+        """Steps that each environment takes in the whole training."""
+        return math.ceil(self.progress.total / self._schedule.num_envs)
+
+    @property
+    def environments(self) -> int:
+        """Environments of all members."""
+        return self._schedule.num_envs * self.population.members
+
+    def seconds_left(self) -> float | None:
+        """Time [s] that is left of a run by the clock, None of one by steps."""
+        return None if self._ends is None else max(self._ends - time.monotonic(), 0.0)
+
+    def end_at(self, total: int) -> None:
+        """Plan a training of `total` steps of each environment."""
+        self.progress.total = total * self._schedule.num_envs
+        self.state = self.population.ending_at(self.state, self.progress.total)
 
     def saved_long_ago(self) -> bool:
         """Whether the last checkpoint is older than `SAVE_EVERY`."""

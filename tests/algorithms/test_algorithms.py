@@ -65,7 +65,7 @@ def gradient_of(
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """(start states (32, 2), loss, its gradient (1, 2)) of u = -gain x on 32 worlds, none of which begins anew.
 
-    `swept` settings are traced, as in a population. The window is the last one.
+    `swept` settings are traced, as in a population. The training is about to end.
     """
     settings = {"num_envs": 32, "windows_per_episode": (33,), "policy_layers": (), "gradient_steps": 1, **settings}
     environments = Environments(LinearQuadratic(), 32, Shards())
@@ -76,7 +76,9 @@ def gradient_of(
         own = dataclasses.replace(config.gradient, **settings, **traced)
         algorithm = FirstOrderGradient(dataclasses.replace(config, gradient=own), environments)
         state = algorithm.init(jax.random.PRNGKey(1))._replace(
-            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=jnp.ones((), jnp.int32)
+            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}},
+            windows=jnp.ones((), jnp.int32),
+            progress=jnp.ones(()),
         )
         after, _ = algorithm.collect(state, environments.begin(states), [jax.random.PRNGKey(2)], TRAIN)
         return after.loss, after.slope["hidden_0"]["kernel"]
@@ -163,16 +165,18 @@ def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(
     kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
     states = environments.reset(jax.random.PRNGKey(0))
 
-    def loss(windows: Any) -> Any:
+    def loss(progress: Any) -> Any:
         state = algorithm.init(jax.random.PRNGKey(1))._replace(
-            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=windows
+            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}},
+            windows=jnp.ones((), jnp.int32),
+            progress=progress,
         )
         after, _ = algorithm.collect(state, environments.begin(states), [jax.random.PRNGKey(2)], TRAIN)
         return after.loss
 
     both = jax.vmap(loss)
-    for windows, wanted in ((74, losses[0]), (75, losses[1])):
-        np.testing.assert_allclose(both(jnp.array([windows, windows])), wanted, rtol=1e-5)
+    for progress, wanted in ((0.74, losses[0]), (0.75, losses[1])):
+        np.testing.assert_allclose(both(jnp.array([progress, progress])), wanted, rtol=1e-5)
     primitives = [str(equation.primitive) for equation in jax.make_jaxpr(both)(jnp.array([1, 1])).eqns]
     assert "cond" in primitives
 

@@ -335,7 +335,7 @@ def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent)
             square = np.square(network.deviation) + np.square(network.mean)
             state = algorithm.init(jax.random.key(1))._replace(
                 **{"layers": network.layers, "mean": network.mean, "square": square, "seen": np.float32(1)},
-                windows=jnp.ones((), jnp.int32),
+                **{"windows": jnp.ones((), jnp.int32), "progress": jnp.ones(())},
             )
             losses.append(float(jax.jit(algorithm.collect)(state, envs, [key], TRAIN)[0].loss))
         impulse = jax.random.normal(jax.random.fold_in(key, 1), (worlds, env.action_size - 7))
