@@ -208,6 +208,27 @@ def test_resume_finishes_an_interrupted_run(interrupted: Path, short_verdict: No
     assert (interrupted / "config.json").read_bytes() == recorded
 
 
+@pytest.mark.slow
+def test_a_run_by_the_clock_is_continued_for_the_time_that_is_left(
+    tmp_path: Path, short_verdict: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C early in five minutes; told that they are over, it ends after a row with a follower, and is finished."""
+    assert "run/policy.npz" in stopped(tmp_path, ROW, signal.SIGINT, minutes=5)
+    place = tmp_path / "run" / "config.json"
+    before = rows_of(tmp_path / "run")
+    origin = json.loads(place.read_text())
+    assert origin["minutes"] == 5
+    place.write_text(json.dumps({**origin, "minutes": 1e-3}))
+    assert call(main, ["--resume", tmp_path / "run"]) == 0
+    rows = rows_of(tmp_path / "run")
+    assert rows[: len(before)] == before
+    assert len(rows) <= len(before) + 2
+    assert rows[-1]["eval_return"]
+    assert load_arrays(tmp_path / "run" / "policy.npz")[1]["training_steps"] == int(rows[-1]["steps"])
+    assert call(main, ["--resume", tmp_path / "run"]) == 0
+    assert "nothing is left to do" in capsys.readouterr().out
+
+
 # --- bad input ------------------------------------------------------------------------------------------------------
 
 BAD_ARGUMENTS = {
@@ -246,6 +267,12 @@ BAD_ARGUMENTS = {
     "noise of a billion deviations": ["--scenario.noise", "0,1e9"],
     "a load that moves at 1e9 rad/s": ["--scenario.cg_speed", "0,1e9"],
     "a seed of 400 digits": ["--seed", "9" * 400],
+    "no time": ["--minutes", 0],
+    "no number of minutes": ["--minutes", "nan"],
+    "a year": ["--minutes", 525600],
+    "by the clock on several machines": ["--minutes", 1, "--distributed"],
+    "by the clock in parts": ["--minutes", 1, "--seeds", 2, "--share", "0/2"],
+    "resume with another time": ["--resume", "full", "--minutes", 1],
     "a billion processes": ["--distributed", "--coordinator", "h:1", "--processes", 10**9, "--process", 0],
 }
 
