@@ -1,7 +1,7 @@
 """The flights of a draw: candidates of the tracks that the oracle succeeds in, with its arrivals.
 
-Those of draw 0 are stored in one file a track (`python -m mjxball.bench.store` writes them), those of another draw
-are found when they are asked for, by the same function.
+Those of draw 0 are stored in one file a track (`python -m mjxball.bench.store` writes them), and so are a few of draw 1
+on some tracks, for `mjxball.bench.quick`. Those of another draw are found when asked for, by the same function.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from mjxball.reading import parse_json
 from mjxball.sim.scenario import Scenario
 
 STORED_DRAW = 0
+QUICK_DRAW, QUICK_FLIGHTS, QUICK_TRACKS = 1, 50, ("pair", "crazyflie")
 LEFT = 5.0  # least time between the deadline and the end of a flight [s]
 MOST_TRIES = 20  # largest number of candidates for each flight wanted, before an error says that the oracle fails
 # Parts of a configuration that act on a flight.
@@ -59,14 +60,25 @@ def groups_of(track: str, draw: int) -> tuple[Group, ...]:
 
     Raises InputError if the stored flights are not of this version's definition, or if the oracle succeeds too rarely.
     """
-    plants = TRACKS[track].flights(draw)
     if draw != STORED_DRAW:
+        plants = TRACKS[track].flights(draw)
         return tuple(sample_group(track, draw, number, plant) for number, plant in enumerate(plants))
-    stored = read_stored(track)
+    return _stored_groups(track, draw, read_stored(track))
+
+
+@functools.cache
+def quick_group(track: str) -> Group:
+    """A few flights of one of `QUICK_TRACKS`, of a draw of their own; cached. Raises InputError as `groups_of`."""
+    (group,) = _stored_groups(track, QUICK_DRAW, read_stored(f"{track}-quick"))
+    return group
+
+
+def _stored_groups(track: str, draw: int, stored: dict[str, Any]) -> tuple[Group, ...]:
+    plants = TRACKS[track].flights(draw)
     if len(stored["plants"]) != len(plants):
         raise changed(track)
     groups = tuple(
-        _rebuilt(track, number, plant, known)
+        _rebuilt(track, draw, number, plant, known)
         for number, (plant, known) in enumerate(zip(plants, stored["plants"], strict=True))
     )
     if definition(groups) != stored["definition"]:
@@ -74,10 +86,19 @@ def groups_of(track: str, draw: int) -> tuple[Group, ...]:
     return groups
 
 
-def stored_form(track: str) -> dict[str, Any]:
-    """What the file of a track stores: which candidates the flights of draw 0 are, and when the oracle arrives."""
+def stored_forms(track: str) -> dict[str, dict[str, Any]]:
+    """What the files of a track store, by the files' stems: the flights of draw 0, and a few of `QUICK_DRAW`."""
     plants = TRACKS[track].flights(STORED_DRAW)
-    groups = [sample_group(track, STORED_DRAW, number, plant) for number, plant in enumerate(plants)]
+    found = {track: _stored_form(track, track, STORED_DRAW, plants)}
+    if track in QUICK_TRACKS:
+        few = [dataclasses.replace(one, count=QUICK_FLIGHTS) for one in TRACKS[track].flights(QUICK_DRAW)]
+        found[f"{track}-quick"] = _stored_form(f"{track}-quick", track, QUICK_DRAW, few)
+    return found
+
+
+def _stored_form(name: str, track: str, draw: int, plants: Sequence[PlantFlights]) -> dict[str, Any]:
+    """Which candidates the flights are, and when the oracle arrives."""
+    groups = [sample_group(track, draw, number, plant) for number, plant in enumerate(plants)]
     rows = [
         {
             "moving": plant.moving,
@@ -90,12 +111,12 @@ def stored_form(track: str) -> dict[str, Any]:
         }
         for plant, group in zip(plants, groups, strict=True)
     ]
-    return {"benchmark": NAME, "version": VERSION, "track": track, "definition": definition(groups), "plants": rows}
+    return {"benchmark": NAME, "version": VERSION, "track": name, "definition": definition(groups), "plants": rows}
 
 
 @functools.cache
 def read_stored(track: str) -> dict[str, Any]:
-    """The stored file of a track; InputError if there is none of this version."""
+    """The stored file of a track, by its stem; InputError if there is none of this version."""
     path = resources.files("mjxball.bench") / "draws" / f"{track}.json"
     if not path.is_file():
         raise InputError(f"flights of track {track} are not stored; python -m mjxball.bench.store {track} does it")
@@ -136,12 +157,12 @@ def _in_full(value: Any) -> str:
     return f"{type(value).__qualname__}({fields})"
 
 
-def _rebuilt(track: str, number: int, plant: PlantFlights, stored: dict[str, Any]) -> Group:
-    """The flights of draw 0 on plant `number`, without flying the oracle."""
+def _rebuilt(track: str, draw: int, number: int, plant: PlantFlights, stored: dict[str, Any]) -> Group:
+    """The stored flights of a draw on plant `number`, without flying the oracle."""
     flights = []
     for condition in CONDITIONS:
         for which, arrival in stored[condition]:
-            scenario = candidate(track, STORED_DRAW, number, condition, which, plant.sample)
+            scenario = candidate(track, draw, number, condition, which, plant.sample)
             if scenario is None:
                 raise changed(track)
             flights.append(_flight(plant, condition, which, scenario, arrival))

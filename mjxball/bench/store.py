@@ -1,4 +1,4 @@
-"""Store the flights of draw 0 with the oracle's arrivals: `python -m mjxball.bench.store [TRACK ...]`."""
+"""Store flights with the oracle's arrivals: `python -m mjxball.bench.store [TRACK ...]`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjxball.bench.draw import stored_form
+from mjxball.bench.draw import stored_forms
 from mjxball.bench.tracks import TRACKS
 from mjxball.cli import make_parser
 from mjxball.files import write_atomically
@@ -24,9 +24,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown := sorted(set(options.tracks) - set(TRACKS)):
         parser.error(f"there is no track {unknown[0]}")
     for track in options.tracks or TRACKS:
-        text = json.dumps(stored_form(track), indent=None, separators=(",", ":"))
         FOLDER.mkdir(exist_ok=True)
-        write_atomically(FOLDER / f"{track}.json", text.replace("},{", "},\n{") + "\n")
+        for stem, stored in stored_forms(track).items():
+            text = json.dumps(stored, indent=None, separators=(",", ":"))
+            write_atomically(FOLDER / f"{stem}.json", text.replace("},{", "},\n{") + "\n")
         sys.stdout.write(f"{track}: stored\n")
     return 0
 

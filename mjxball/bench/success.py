@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from mjxball.evaluate.metrics import Metrics
 
@@ -61,6 +60,8 @@ def reasons(metrics: Metrics, deadline: float, cpu_time: float = 0.0) -> tuple[s
 
 def interval(succeeded: int, flights: int) -> tuple[float, float]:
     """Wilson's 95 % interval of the share of successes."""
+    from scipy.stats import binomtest  # takes half a second to import
+
     found = binomtest(succeeded, flights).proportion_ci(CONFIDENCE, method="wilson")
     return float(found.low), float(found.high)
 

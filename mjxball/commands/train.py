@@ -8,10 +8,10 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,10 @@ from mjxball.train import processes, shares
 from mjxball.train.curves import plot_training
 from mjxball.train.run_directory import CHECKPOINTS, POLICY
 from mjxball.xla import check_address_space, enable_compilation_cache
+
+if TYPE_CHECKING:
+    from mjxball.commands.watch import Watch
+    from mjxball.train.run import Run
 
 # Settings that `--help` lists; `--help all` lists every one.
 COMMON = (
@@ -148,6 +152,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     check = (lambda: None) if resume else (lambda: output_directory(out))
     from mjxball.train.compilation import jax_setting
 
+    watches: list[Watch] = []
     # Float32 even if JAX_ENABLE_X64 is set, so that a run is reproducible and can be resumed.
     with contextlib.ExitStack() as hold, jax_setting("jax_enable_x64", False):
         if rendezvous:
@@ -160,8 +165,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
             begun = hold.enter_context(clean_up_unless_begun(out, undone))
             with ThreadPoolExecutor(1) as pool:
 
-                def prepare() -> None:
+                def prepare(run: Run) -> None:
                     begun()
+                    if is_evaluated(origin) and origin["seeds"] == 1 and not rendezvous:
+                        watches.extend(_watched(run, started))
                     if writes and options.plant:
                         warn(rig_summary(settings))
                     if writes and is_evaluated(origin):
@@ -170,10 +177,29 @@ def _train(options: argparse.Namespace, command: str) -> int:
                 code = _run(settings, origin, out, resume, prepare, options.tracker, started)
             if rendezvous:
                 processes.leave()
-        return _finish(settings, origin, out, code, started) if writes else code or 0
+        return _finish(settings, origin, out, code, started, watches) if writes else code or 0
 
 
-def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: int | None, started: float) -> int:
+def _watched(run: Run, began: float) -> list[Watch]:
+    """The watch of a run that has begun; none where the benchmark has no flights for its settings."""
+    from mjxball.bench.quick import quick_track
+    from mjxball.commands.watch import Watch
+
+    track = quick_track(run.config)
+    if track is None:
+        return []
+    run.on_evaluated = found = Watch(track, began, run.progress.say)
+    return [found]
+
+
+def _finish(
+    settings: config.Config,
+    origin: dict[str, Any],
+    out: Path,
+    code: int | None,
+    started: float,
+    watches: Sequence[Watch],
+) -> int:
     """Report a training that ended with `code` (see `_run`) and evaluate its policy; return the exit code."""
     if code is None and (out / "eval" / RESULTS).exists():
         print(f"{out} was finished and evaluated before; nothing is left to do")
@@ -188,7 +214,13 @@ def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: in
         return 0
     if origin["seeds"] > 1:
         compare_members(settings, out, origin)
-    return compare(settings, origin["physics"], out, out / POLICY)
+    code = compare(settings, origin["physics"], out, out / POLICY)
+    for watched in watches:
+        from mjxball.commands.watch import write
+
+        watched.end()
+        print(write(watched, out / "eval"))
+    return code
 
 
 def _run(
@@ -196,7 +228,7 @@ def _run(
     origin: dict[str, Any],
     out: Path,
     resume: bool,
-    on_start: Callable[[], None],
+    on_start: Callable[[Run], None],
     tracker: str | None,
     began: float,
 ) -> int | None:
@@ -225,8 +257,9 @@ def _run(
             warn(f"continuing {out} after {steps:,} of {total:,} steps")
         if steps >= total:
             return None
+    run = Run(settings, out, origin, state, start, began)
     try:
-        return 0 if loop.train(Run(settings, out, origin, state, start, began), on_start) else 130
+        return 0 if loop.train(run, lambda: on_start(run)) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             saved = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))

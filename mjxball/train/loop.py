@@ -13,6 +13,7 @@ from mjxball.train import processes
 from mjxball.train import program as programs
 from mjxball.train.program import TrainingProgram
 from mjxball.train.run import Chunk, Run, Stop, graceful_interrupt
+from mjxball.train.run_directory import POLICY
 
 CHUNKS = 25  # rows of metrics.csv in a run, at most
 
@@ -68,6 +69,8 @@ def learn(run: Run, stop: Stop) -> bool:
                 run.end_at(plan.total)
         if evaluates or late:
             run.save()
+        if evaluates and run.on_evaluated:
+            run.on_evaluated(run.out / POLICY)
     return not ended
 
 

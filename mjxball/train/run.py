@@ -141,6 +141,7 @@ class Run:
         begun = time.monotonic() if began is None else began
         self._ends = None if minutes is None else begun + 60 * minutes - self.progress.before
         self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
+        self.on_evaluated: Callable[[Path], None] | None = None  # is called with the policy file after an evaluation
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
         self._clock = ThreadPoolExecutor(1)  # waits for the devices to take the time
         self._checkpoints: Future[Any] | None = None

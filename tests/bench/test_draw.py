@@ -25,8 +25,10 @@ STORED = tuple(path.stem for path in sorted(store.FOLDER.glob("*.json")))
 
 
 def flights_of(track: str) -> list[draw.Flight]:
-    """All stored flights of a track."""
-    return [one for group in groups_of(track, 0) for one in group.flights]
+    """All stored flights of a file."""
+    name, few, _ = track.partition("-quick")
+    groups = [draw.quick_group(name)] if few else groups_of(name, 0)
+    return [one for group in groups for one in group.flights]
 
 
 @pytest.mark.parametrize("track", STORED)
@@ -34,7 +36,8 @@ def test_stored_flights_are_those_that_the_source_samples(track: str) -> None:
     """`groups_of` compares the hash of their definition."""
     flights = flights_of(track)
     for condition in CONDITIONS:
-        assert sum(one.condition == condition for one in flights) == FLIGHTS
+        wanted = draw.QUICK_FLIGHTS if track.endswith("-quick") else FLIGHTS
+        assert sum(one.condition == condition for one in flights) == wanted
     assert all(one.deadline <= one.scenario.seconds - draw.LEFT for one in flights)
     assert all(one.scenario.disturbance == Disturbance(offset=1.0) for one in flights if one.condition == "calm")
 
@@ -140,7 +143,8 @@ def test_flights_of_another_definition_are_refused(monkeypatch: pytest.MonkeyPat
 
 
 def test_storing_a_track_writes_what_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a track of two flights, whose file is then read in place of the other."""
+    """By a track of two flights, whose files are then read in place of the others."""
+    monkeypatch.setattr(draw, "QUICK_FLIGHTS", 3)
 
     def sample(random: np.random.Generator, condition: str) -> Scenario:
         return Scenario(amplitude=0.02, goal=tuple(map(float, random.uniform(0.3, 0.5, 3))), seconds=20.0)
@@ -151,7 +155,11 @@ def test_storing_a_track_writes_what_is_read(tmp_path: Path, monkeypatch: pytest
     assert store.main(["pair"]) == 0
     try:
         draw.read_stored.cache_clear()
-        assert draw.definition(groups_of.__wrapped__("pair", 0)) == draw.stored_form("pair")["definition"]
+        stored = draw.stored_forms("pair")
+        assert draw.definition(groups_of.__wrapped__("pair", 0)) == stored["pair"]["definition"]
+        few = draw.quick_group.__wrapped__("pair")
+        assert draw.definition((few,)) == stored["pair-quick"]["definition"]
+        assert len(few.flights) == 2 * draw.QUICK_FLIGHTS
         with pytest.raises(InputError, match="flights of track team are not stored"):
             draw.read_stored("team")
     finally:

@@ -1,0 +1,76 @@
+"""A few flights of the benchmark in this process, and what a training says of them."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mjxball.baselines import make_baseline
+from mjxball.bench.draw import QUICK_FLIGHTS, QUICK_TRACKS, groups_of, quick_group
+from mjxball.bench.quick import quick_success, quick_track
+from mjxball.commands import watch
+from mjxball.commands.watch import Watch, write
+from mjxball.config import preset
+from mjxball.policy.file import shipped_policy
+
+
+def test_the_few_flights_are_not_those_that_are_ranked() -> None:
+    for track in QUICK_TRACKS:
+        few, (ranked,) = quick_group(track), groups_of(track, 0)
+        assert few.config == ranked.config
+        assert [one.condition for one in few.flights] == ["calm"] * QUICK_FLIGHTS + ["world"] * QUICK_FLIGHTS
+        goals = {one.scenario.goal for one in ranked.flights}
+        assert not goals.intersection(one.scenario.goal for one in few.flights)
+
+
+def test_presets_know_their_track() -> None:
+    known = {"transport": "pair", "balance": "pair", "flight": "crazyflie", "team": None, "universal": None}
+    assert {name: quick_track(preset(name)) for name in known} == known
+
+
+@pytest.mark.slow
+def test_followers_flown_together_succeed_as_each_alone() -> None:
+    config = quick_group("pair").config
+    names = ("copy", "lqg-calm", "lqg")
+    together = quick_success("pair", [make_baseline(name, config) for name in names])
+    assert together[0] == {"calm": 0.0, "world": 0.0}
+    assert quick_success("pair", [make_baseline("lqg", config)]) == together[2:]
+    assert together[2]["calm"] > 0.85  # 95 % of the flights that are ranked
+    assert together[2]["world"] < 0.5
+
+
+def test_a_watch_says_the_newest_and_writes_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun, go, flown = threading.Event(), threading.Event(), list[list[str]]()
+
+    def success(track: str, followers: Any) -> list[dict[str, float]]:
+        flown.append([one.name for one in followers])
+        begun.set()
+        assert go.wait(20)
+        return [{"calm": 0.5 + 0.1 * k, "world": 0.25} for k in range(len(followers))]
+
+    monkeypatch.setattr(watch, "quick_success", success)
+    said = list[str]()
+    watched = Watch("pair", 0.0, said.append)
+    assert begun.wait(20)
+    for name in ("sac", "paper", "balance"):  # while the known followers fly; only the last is still of interest
+        watched(shipped_policy(name))
+    go.set()
+    watched.end()
+    assert flown == [["lqg", "balance"], ["balance"]]
+    (line,) = said
+    assert "50/25 % calm/world (lqg 50/25; balance 60/25)" in line
+    table = write(watched, tmp_path / "eval").splitlines()
+    assert [row.split() for row in table[1:]] == [
+        ["this", "policy", "50", "25"],
+        ["lqg", "50", "25"],
+        ["balance", "60", "25"],
+    ]
+    record = json.loads((tmp_path / "eval" / "success.json").read_text())
+    assert [sorted(one) for one in record["points"]] == [["calm", "seconds", "world"]]
+    assert (tmp_path / "eval" / "success.png").stat().st_size > 5000
