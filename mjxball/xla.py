@@ -24,6 +24,18 @@ def compile_small_loops_whole() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()
 
 
+# XLA runs the small operations of one device on one core. Environments are cut into as many parts wherever there are
+# cores for them or not, so that a seed gives the same training everywhere.
+CPU_DEVICES = "--xla_force_host_platform_device_count=2"
+
+
+def use_two_cpu_devices() -> None:
+    """Add `CPU_DEVICES` to XLA_FLAGS of this process, unless they already say how many there are."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if CPU_DEVICES.partition("=")[0] not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {CPU_DEVICES}".strip()
+
+
 def explained(error: BaseException) -> str | None:
     """A sentence on what the user can do about an `error` of JAX; None for other errors.
 

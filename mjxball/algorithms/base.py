@@ -91,22 +91,39 @@ class PolicyNetwork(NamedTuple):
 
 
 class Shards(NamedTuple):
-    """Division of one learner's environments, replay and batches into `parts` equal parts along a mapped axis."""
+    """Division of one learner's environments, replay and batches into `parts` equal parts along a mapped axis.
+
+    Parts that are not `joined` do not exchange anything: means and sums are those of one part, which the host averages
+    (`Population`). So it is on the devices of one CPU, where XLA's collectives can wait for each other for ever: they
+    block the threads that the other device needs.
+    """
 
     axis: str | None = None
     parts: int = 1
+    joined: bool = True
 
     def own(self, key: Array) -> Array:
         """A key unique to this shard, derived from a `key` that all shards share."""
         return jax.random.fold_in(key, jax.lax.axis_index(self.axis)) if self.axis else key
 
+    def cut(self, whole: Any) -> Any:
+        """This shard's part of `whole`, whose first axis runs over all shards."""
+        if not self.axis:
+            return whole
+        count = len(whole) // self.parts
+        return jax.lax.dynamic_slice_in_dim(jnp.asarray(whole), jax.lax.axis_index(self.axis) * count, count)
+
+    def gathered(self, part: Array) -> Array:
+        """The parts of all shards that are joined, along the first axis."""
+        return jax.lax.all_gather(part, self.axis, tiled=True) if self.axis and self.joined else part
+
     def mean(self, value: Any) -> Any:
         """Mean over the shards."""
-        return jax.lax.pmean(value, self.axis) if self.axis else value
+        return jax.lax.pmean(value, self.axis) if self.axis and self.joined else value
 
     def total(self, value: Any) -> Any:
         """Sum over the shards."""
-        return jax.lax.psum(value, self.axis) if self.axis else value
+        return jax.lax.psum(value, self.axis) if self.axis and self.joined else value
 
 
 class Transition(NamedTuple):
@@ -129,7 +146,7 @@ class EnvironmentBatch(Protocol):
     recurrent_slots: slice  # entries of an observation that hold a recurrent policy's state; empty without one
     policy_mask: Any  # (n,) 1 for entries of an observation that the policy may use, else 0
     critic_mask: Any  # (n,) 1 for entries that critics may use, else 0
-    turn: Any  # (count,) integer offset of each environment, to stagger the starts of episodes
+    turn: Any  # (count,) integer offset of each environment, to stagger the starts of episodes; traced in a shard
     shards: Shards
     smooth: bool  # whether all outputs of a step have a reverse-mode gradient, also those independent of the action
 

@@ -82,6 +82,7 @@ class FirstOrderGradient:
     metrics = ("loss", "gradient_norm")
     engines = ("newton-euler",)  # MJX's solver iterates in a loop, which has no reverse-mode gradient
     prefers_cpu = True
+    averaged = ("slope", "loss", "mean", "square")  # of the state after `collect`, over parts that are not joined
     collect_keys = 1
     update_keys = 0
 
@@ -160,14 +161,14 @@ class FirstOrderGradient:
         begins = begins_episode(environments.turn, state.windows, self._config.windows_per_episode)
         envs = environments.restart(envs, keys[0], begins & phase.recording)
         if self._exchanges:
-            envs = self._exchanged(envs, self._shards.own(jax.random.fold_in(keys[0], 2)), phase)
+            envs = self._exchanged(envs, jax.random.fold_in(keys[0], 2), phase)
         # Where possible, differentiate by the initial states too: JAX then knows which carries have a gradient.
         arguments = (0, 2) if environments.smooth else (0,)
         differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
         flown = functools.partial(differentiated, state.layers, state, envs)
         if self._responds:
-            own_key = self._shards.own(jax.random.fold_in(keys[0], 1))
-            impulse = jax.random.normal(own_key, (len(envs.states.obs), self._actions))
+            size = (len(envs.states.obs) * self._shards.parts, self._actions)
+            impulse = self._shards.cut(jax.random.normal(jax.random.fold_in(keys[0], 1), size))
             late = _unbatched(state.progress) >= IMPULSE_RESPONSE_FROM
             with_impulse, without = functools.partial(flown, impulse), functools.partial(flown, ())
             (loss, (envs, mean, square)), (slope, *_) = jax.lax.cond(late, with_impulse, without)
@@ -193,9 +194,12 @@ class FirstOrderGradient:
         """`envs`, each of which gets the state of another one's GRU with probability `exchanged_memory`."""
         whose_key, own_key = jax.random.split(key)
         seen = envs.states.obs
-        memory, count = seen[:, self._slots], len(seen)
-        other = jnp.roll(memory, jax.random.randint(whose_key, (), 1, max(count, 2)), axis=0)
-        taken = (jax.random.uniform(own_key, (count,)) < self._config.exchanged_memory) & phase.recording
+        memory, cut = seen[:, self._slots], self._shards.cut
+        everyone = self._shards.gathered(memory)
+        other = jnp.roll(everyone, jax.random.randint(whose_key, (), 1, max(len(everyone), 2)), axis=0)
+        other = other if other.shape == memory.shape else cut(other)
+        exchanged = cut(jax.random.uniform(own_key, (self._config.num_envs,))) < self._config.exchanged_memory
+        taken = exchanged & phase.recording
         seen = seen.at[:, self._slots].set(jnp.where(taken[:, None], other, memory))
         return envs._replace(states=envs.states.replace(obs=seen))
 

@@ -34,7 +34,7 @@ from mjxball.train.run_directory import (
     start_policy,
     versions,
 )
-from mjxball.xla import compile_small_loops_whole
+from mjxball.xla import compile_small_loops_whole, use_two_cpu_devices
 
 MOST_MINUTES = 1e5
 # Packages that a run imports only after it has begun, some after hours.
@@ -196,7 +196,7 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
 
 
 def _choose_processor(algorithm: Any) -> None:
-    """Select the CPU, with small loops compiled whole, for an algorithm that prefers it (`Algorithm`).
+    """Select the CPU, as two devices, with small loops compiled whole, for an algorithm that prefers it (`Algorithm`).
 
     JAX_PLATFORMS, if set, takes precedence.
     """
@@ -205,6 +205,7 @@ def _choose_processor(algorithm: Any) -> None:
     if not getattr(algorithm, "prefers_cpu", False):
         return
     compile_small_loops_whole()
+    use_two_cpu_devices()
     if not os.environ.get("JAX_PLATFORMS"):
         settings: Any = jax.config
         settings.update("jax_platforms", "cpu")

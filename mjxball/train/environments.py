@@ -120,24 +120,31 @@ class Environments:
         closed = self.smooth and env.backend == "newton-euler" and jax.default_backend() == "cpu"
         self._step = (scalar_form if closed else jax.vmap)(env.step)
         sizes = getattr(env, "team_sizes", None)
-        self._agents = Agents(sizes, env.config.plant.count - 1, count) if sizes else None
-        self.turn = self._agents.turn if self._agents else np.arange(count)
+        slots, whole = env.config.plant.count - 1 if sizes else 0, count * self.shards.parts
+        self._agents = Agents(sizes, slots, count) if sizes else None
+        self._turns = Agents(sizes, slots, whole).turn if sizes else np.arange(whole)
 
     @property
     def _worlds(self) -> int:
         return self._agents.worlds if self._agents else self.count
 
+    @property
+    def turn(self) -> Any:
+        """See `mjxball.algorithms.base.EnvironmentBatch`."""
+        return self.shards.cut(self._turns)
+
     def reset(self, key: Array) -> Any:
-        """Sampled initial states of all environments."""
-        keys = jax.random.split(self.shards.own(key), self._worlds)
+        """Sampled initial states of all environments, the same however they are cut into shards."""
+        whole = self._worlds * self.shards.parts
+        keys = self.shards.cut(jax.random.split(key, whole))
         if self._agents:
-            fresh = jax.vmap(self.env.reset)(keys, jnp.arange(self._worlds))
+            fresh = jax.vmap(self.env.reset)(keys, self.shards.cut(jnp.arange(whole)))
             return self._agents.per_agent(fresh)
         return jax.vmap(self.env.reset)(keys)
 
     def staggered(self, states: Any, key: Array, episode_steps: int) -> Any:
         """`states` with random step counters, so that episodes do not end together."""
-        steps = jax.random.randint(self.shards.own(key), (self._worlds,), 0, episode_steps)
+        steps = self.shards.cut(jax.random.randint(key, (self._worlds * self.shards.parts,), 0, episode_steps))
         if "steps" in states.info:
             dtype = states.info["steps"].dtype
             return states.replace(info={**states.info, "steps": steps.astype(dtype)})

@@ -17,6 +17,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from mjxball import config as configs
 from mjxball.algorithms.base import PolicyNetwork, Shards, TrainingPhase
 from mjxball.config import Config
+from mjxball.errors import InputError
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
 from mjxball.train.compilation import Carrying, TracedProgram, compiler_options, jax_setting, partitioned_by_gspmd
@@ -55,7 +56,8 @@ class Population:
 
     Member k has seed `seed + k` and the k-th value of every swept setting. In one process, members are distributed over
     its devices if these divide their number, else all use the first device. With several processes (see `processes`),
-    members are distributed over all devices, and if there are fewer members, each member's environments are too.
+    members are distributed over all devices, and if there are fewer members, each member's environments are too; in one
+    process also those of an algorithm that prefers the CPU, over the CPU's devices, where their number allows it.
     """
 
     def __init__(
@@ -74,18 +76,30 @@ class Population:
         self._values = {name: np.asarray(values, np.float32) for name, values in self._sweep.items()}
         if devices is None:
             devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
-        groups, parts = grid(members, len(devices), split=jax.process_count() > 1)
-        spread = groups * parts > 1
-        self.mesh = _mesh(devices, groups, parts) if spread else None
+        together, cores = jax.process_count() > 1, jax.default_backend() == "cpu"
+        may_split = together or (cores and getattr(extensions.algorithm, "prefers_cpu", False))
+        groups, parts = grid(members, len(devices), split=may_split)
+        try:
+            self.program = self._program(parts)
+        except InputError:
+            if together:
+                raise
+            groups, parts = grid(members, len(devices), split=False)
+            self.program = self._program(parts)
+        self.mesh = _mesh(devices, groups, parts) if groups * parts > 1 else None
         self.devices, self.parts = groups * parts, parts
-        self._shards = Shards("envs", parts) if parts > 1 else Shards()
-        self.program = TrainingProgram(config, physics, shards=self._shards, extensions=extensions)
-        self.program.algorithm.check_parts(parts)
         whole: Any = PartitionSpec() if self._single else PartitionSpec("members")
         split: Any = PartitionSpec(*whole, "envs")
         self._whole, self._split = whole, split
         self._state_spec = TrainState(self.program.algorithm.partition(whole, split), split, whole, whole, whole)
         self._statistics_spec = Statistics(whole, whole, whole, split)
+
+    def _program(self, parts: int) -> TrainingProgram:
+        """The program for one of `parts` of the environments; InputError if they cannot be cut."""
+        self._shards = Shards("envs", parts, jax.process_count() > 1) if parts > 1 else Shards()
+        program = TrainingProgram(self.config, self._physics, shards=self._shards, extensions=self._extensions)
+        program.algorithm.check_parts(parts)
+        return program
 
     def member_config(self, member: int) -> Config:
         """Configuration of one member."""
@@ -231,14 +245,33 @@ class Population:
         """
         phase, window = self.place_phase(mode.phase), self.program.algorithm.steps_per_collect
         carried, metrics, taken = FlatState(state, self.no_statistics()), self.no_metrics(), 0
+        apart = self.parts > 1 and not self._shards.joined
+        averaged = self._averaged(state) if apart else []
         while taken < int(mode.steps):
             keys = compiled.collect(carried, phase)
+            for number in averaged:
+                carried.arrays[number] = _over_parts(carried.arrays[number], np.mean)
             if mode.phase.learning:
                 metrics = compiled.update(carried, keys)
             taken += window
             if pause():
                 break
-        return *carried.trees(), self.named(metrics), taken
+        state, statistics = carried.trees()
+        return state, _joined(statistics) if apart else statistics, self.named(metrics), taken
+
+    def _averaged(self, state: TrainState) -> list[int]:
+        """Numbers of the arrays of `state` that differ between parts after `collect`; see `Shards`."""
+        names: Any = self.program.algorithm
+        flags = state._replace(
+            algorithm=type(state.algorithm)(
+                *(
+                    jax.tree.map(lambda _, name=name: name in names.averaged, value)
+                    for name, value in zip(state.algorithm._fields, state.algorithm, strict=True)
+                )
+            ),
+            **{name: jax.tree.map(lambda _: False, getattr(state, name)) for name in ("envs", "key", "steps", "total")},
+        )
+        return [number for number, flag in enumerate(jax.tree.leaves(flags)) if flag]
 
     def evaluation_envs(self, compiled: Compiled) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""
@@ -396,6 +429,22 @@ class Population:
         if not values:
             return self.program
         return TrainingProgram(self.config, self._physics, values, self._shards, self._extensions)
+
+
+def _over_parts(array: Array, mean: Callable[..., Any]) -> Array:
+    """An array that should be equal on all devices, as the mean or sum over them."""
+    parts = [np.asarray(part.data) for part in array.addressable_shards]
+    return jax.device_put(mean(parts, axis=0, dtype=parts[0].dtype), array.sharding)
+
+
+def _joined(statistics: Statistics) -> Statistics:
+    """Statistics over the parts of the environments; `peaks` are cut already."""
+    total = lambda array: _over_parts(array, np.sum)  # noqa: E731
+    return statistics._replace(
+        reward=_over_parts(statistics.reward, np.mean),
+        ended=total(statistics.ended),
+        totals={name: total(value) for name, value in statistics.totals.items()},
+    )
 
 
 def _when_ready(pending: Future[Callable[..., Any]]) -> Callable[..., Any]:

@@ -164,7 +164,8 @@ class Run:
     def start(self) -> None:
         """Compile, and create the initial state, or place the resumed state on the devices."""
         devices = self.population.devices
-        what = f"the training program for {devices} x {jax.devices()[0].device_kind}"
+        kind = jax.devices()[0].device_kind
+        what = f"the training program for {'the CPU' if kind == 'cpu' else f'{devices} x {kind}'}"
         self.progress.begin("compiling", what, "Ctrl-C stops")
         creating = self._state is None
         self._compiled = self.population.compile(creating)

@@ -62,3 +62,65 @@ def test_every_algorithm_trains_two_members_on_two_devices(engine: str, units: i
     assert done.returncode == 0, done.stderr[-3000:]
     algorithms = [name for name in ALGORITHMS if engine in find(name, "--algorithm").engines]
     assert done.stdout.splitlines() == [f"{name} trained" for name in algorithms]
+
+
+CUT = """
+import jax, numpy as np
+from mjxball import config as configs
+from mjxball.config import preset
+from mjxball.train import processes
+from mjxball.train import program as programs
+from mjxball.train.extensions import Extensions, resolve
+from mjxball.train.population import Population
+
+def population(config, devices=None):
+    gradient = resolve(Extensions(algorithm="gradient"))
+    return Population(config, "newton-euler", devices=devices, extensions=gradient)
+
+def trained(config, devices=None, stored=False):
+    one = population(config, devices)
+    compiled = one.compile(creating=True)
+    state = one.start(compiled, 5)
+    state, *_ = one.advance(compiled, state, programs.warmup_mode(8))
+    state, statistics, metrics, _ = one.advance(compiled, state, programs.train_mode(40))
+    if stored:
+        state = one.place_state(processes.gather(state))
+    state, *_ = one.advance(compiled, state, programs.train_mode(40))
+    return one.parts, processes.gather(state), processes.gather((statistics, metrics))
+
+def close(first, second, **tolerance):
+    for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_allclose(one, other, **tolerance)
+
+settings = {"gradient.num_envs": %s, "gradient.horizon": 8, "gradient.policy_layers": (8,)}
+settings |= {"gradient.windows_per_episode": (2, 3), "gradient.learning_rate": 1e-3, "follower.recurrent_units": 4}
+config = preset("%s")
+for name, value in settings.items():
+    config = configs.replace(config, name, value)
+parts, whole, seen = trained(config, jax.local_devices()[:1])
+assert parts == 1
+parts, cut, of_cut = trained(config)
+assert parts == 2
+close(whole.algorithm.layers, cut.algorithm.layers, rtol=1e-3, atol=2e-5)
+close(whole.envs.obs, cut.envs.obs, rtol=1e-2, atol=1e-3)
+close(seen, of_cut, rtol=1e-2, atol=1e-3)
+assert whole.steps == cut.steps
+close(trained(config, stored=True)[1], cut, rtol=0, atol=0)  # a run that is continued, to the bit
+assert population(configs.replace(config, "gradient.num_envs", %s)).parts == 1
+print("the same")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [("transport", 12, 9), *weekly(("universal", 22, 11))])
+def test_environments_cut_over_two_cores_train_what_one_core_trains(case: tuple[str, int, int]) -> None:
+    """Sampled worlds, starts of episodes, statistics, the network; `universal` has teams of several sizes."""
+    flags = f"{HASTY} --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    preset, worlds, odd = case
+    command = [sys.executable, "-c", CUT % (worlds, preset, odd)]
+    done = subprocess.run(
+        command, check=False, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout == "the same\n"
