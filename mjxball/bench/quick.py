@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjxball.bench import CONDITIONS
-from mjxball.bench.draw import QUICK_TRACKS, quick_group
+from mjxball.bench.draw import QUICK_TRACKS, Group, quick_group
 from mjxball.bench.evaluation import with_seed
 from mjxball.bench.flying import ENGINE
 from mjxball.bench.success import reasons
@@ -35,7 +35,12 @@ def quick_track(config: Config) -> str | None:
 
 def quick_success(track: str, followers: Sequence[Follower]) -> list[Success]:
     """Success of each of `followers`, flown together, in the few flights of `track`."""
-    config, flights = quick_group(track)
+    return success(quick_group(track), followers)
+
+
+def success(group: Group, followers: Sequence[Follower]) -> list[Success]:
+    """Success of each of `followers`, flown together, in the flights of `group`."""
+    config, flights = group
     scenarios = [with_seed(one, KEY, 0) for one in flights]
     radii, deadlines = (np.array([getattr(one, name) for one in flights]) for name in ("radius", "deadline"))
     repeated = (np.tile(values, len(followers)) for values in (radii, deadlines))

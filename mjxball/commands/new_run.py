@@ -29,6 +29,7 @@ from mjxball.train.run_directory import (
     differences,
     file_hash,
     members_of,
+    read_json,
     read_sweep,
     source_hash,
     start_policy,
@@ -43,8 +44,8 @@ LATE_IMPORTS = ("tensorboardX", "orbax.checkpoint", "mujoco", "scipy", "matplotl
 
 def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
     """(configuration, origin, directory) of a new run. Raises InputError for a request that cannot be trained."""
-    plant_preset = cli.read_plant(options.plant).preset if options.plant else None
-    name, seed = options.preset or plant_preset or "transport", options.seed or 0
+    name, options.algorithm = chosen(options)
+    seed = options.seed or 0
     _refuse_settings_of_others(options)
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= MAX_SEED:
@@ -85,6 +86,24 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     return settings, origin, out
 
 
+def chosen(options: argparse.Namespace) -> tuple[str, str]:
+    """(preset, algorithm) of a command that may leave out either."""
+    swept = read_json(options.sweep, "sweep file") if options.sweep else {}
+    sections = {str(path).partition(".")[0] for path in (*_given(options), *swept)}
+    algorithm = options.algorithm or next((one for one in ALGORITHMS if one in sections), None)
+    if algorithm is None and (options.env or options.physics == "mjx"):  # of which no gradient is known
+        algorithm = "sac"
+    name = options.preset or (cli.read_plant(options.plant).preset if options.plant else None)
+    if name is None:
+        name = "quick" if algorithm in (None, "gradient") and not options.plant else "transport"
+    return name, algorithm or config.algorithm_of(name)
+
+
+def _given(options: argparse.Namespace) -> list[str]:
+    """Names of the settings that a command gives."""
+    return [name.removeprefix("config:") for name, value in vars(options).items() if value and "config:" in name]
+
+
 def check_packages() -> None:
     """Raise ModuleNotFoundError if one of `LATE_IMPORTS` is not installed, before training starts."""
     for name in LATE_IMPORTS:
@@ -120,7 +139,7 @@ def output_directory(out: Path) -> Path:
 
 def _start_from(options: argparse.Namespace, settings: config.Config, members: int) -> Any:
     """The policy file (as in `run_directory.start_policy`) that the run starts from, or a list, one per member."""
-    if (options.algorithm or "sac") != "gradient" or options.env:
+    if options.algorithm != "gradient" or options.env:
         raise InputError(
             "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
         )
@@ -161,9 +180,8 @@ def _digest(names: dict[str, str]) -> str | None:
 
 def _refuse_settings_of_others(options: argparse.Namespace) -> None:
     """Raise InputError for a setting of a built-in algorithm other than the one that trains."""
-    used = options.algorithm or "sac"
-    given = [name.removeprefix("config:") for name, value in vars(options).items() if value and "config:" in name]
-    for path in given:
+    used = options.algorithm
+    for path in _given(options):
         section = path.partition(".")[0]
         if used in ALGORITHMS and section in ALGORITHMS and section != used:
             raise InputError(

@@ -62,7 +62,9 @@ def parser() -> cli.Parser:
         describe=_describe,
     )
     names = ", ".join(config.PRESETS)
-    preset = result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
+    preset = result.add_argument(
+        "preset", nargs="?", metavar="PRESET", help=f"one of {names} (default quick; with SAC or PPO transport)"
+    )
     vars(preset)["suggested"] = tuple(config.PRESETS)
     run = result.add_argument_group("the run")
     run.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
@@ -76,9 +78,12 @@ def parser() -> cli.Parser:
     run.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     about = "begin with the weights of a policy file or shipped policy, or each member with those of a run's"
     run.add_argument("--start-from", type=policy_path, metavar="POLICY", help=about)
-    about = f"one of {', '.join(ALGORITHMS)} (default sac), or MODULE:CLASS, your own"
+    by = [name for name in config.PRESETS if config.algorithm_of(name) == "gradient"]
+    about = (
+        f"one of {', '.join(ALGORITHMS)} (default: gradient for {', '.join(by)}, else sac), or MODULE:CLASS, your own"
+    )
     run.add_argument("--algorithm", metavar="NAME", help=about)
-    about = "engine, mjx (default) or newton-euler, which is quicker"
+    about = "engine, mjx (default; SAC and PPO) or newton-euler, which is quicker (gradients: always)"
     run.add_argument("--physics", choices=TRAINING_ENGINES, metavar="ENGINE", help=about)
     about = f"{', '.join(config.PLANTS)}, or a rig in TOML, JSON, MJCF or URDF (docs/howto/own-rig.md)"
     run.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
@@ -111,7 +116,7 @@ def _describe(parser: cli.Parser, given: argparse.Namespace, topic: str | None) 
         raise InputError(f"no help on {topic!r}; there is --help {', '.join(known)}")
     name = topic if topic in config.PRESETS else given.preset
     plant = cli.read_plant(given.plant) if given.plant else None
-    name = name or (plant.preset if plant else None) or "transport"
+    name = name or (plant.preset or "transport" if plant else "quick")
     cli.show_defaults(parser, config.with_plant(config.preset(name), given.plant, {}))
     on_plant = f" on the plant {given.plant}" if given.plant else ""
     parser.epilog = (
