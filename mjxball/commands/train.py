@@ -170,23 +170,25 @@ def _train(options: argparse.Namespace, command: str) -> int:
             begun = hold.enter_context(clean_up_unless_begun(out, undone))
             with ThreadPoolExecutor(1) as pool:
 
-                def prepare(run: Run) -> None:
+                def prepare() -> None:
                     begun()
-                    if is_evaluated(origin) and origin["seeds"] == 1 and not rendezvous:
-                        watches.extend(_watched(run, started))
                     if writes and options.plant:
                         warn(rig_summary(settings))
                     if writes and is_evaluated(origin):
                         pool.submit(compile_ahead, settings, origin["physics"])
 
-                code = _run(settings, origin, out, resume, prepare, options.tracker, started)
+                def watch(run: Run) -> None:
+                    if is_evaluated(origin) and origin["seeds"] == 1 and not rendezvous:
+                        watches.extend(_watched(run, started))
+
+                code = _run(settings, origin, out, resume, (watch, prepare), options.tracker, started)
             if rendezvous:
                 processes.leave()
         return _finish(settings, origin, out, code, started, watches) if writes else code or 0
 
 
 def _watched(run: Run, began: float) -> list[Watch]:
-    """The watch of a run that has begun; none where the benchmark has no flights for its settings."""
+    """The watch of a run, which it starts; none where the benchmark has no flights for its settings."""
     from mjxball.bench.quick import quick_track
     from mjxball.commands.watch import Watch
 
@@ -194,6 +196,7 @@ def _watched(run: Run, began: float) -> list[Watch]:
     if track is None:
         return []
     run.on_evaluated = found = Watch(track, began, run.progress.say)
+    run.on_traced = found.start
     return [found]
 
 
@@ -224,7 +227,8 @@ def _finish(
         from mjxball.commands.watch import write
 
         watched.end()
-        print(write(watched, out / "eval"))
+        if watched.points:
+            print(write(watched, out / "eval"))
     return code
 
 
@@ -233,13 +237,14 @@ def _run(
     origin: dict[str, Any],
     out: Path,
     resume: bool,
-    on_start: Callable[[Run], None],
+    on: tuple[Callable[[Run], None], Callable[[], None]],
     tracker: str | None,
     began: float,
 ) -> int | None:
     """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train.
 
-    `on_start` is called when everything is compiled and the device begins to train. `began`: when the command did.
+    `on`: what is called with the run before it starts, and when everything is compiled and the device begins to train.
+    `began`: when the command did.
     """
     wake_devices()
     # The algorithm's libraries are imported while the devices start.
@@ -262,9 +267,10 @@ def _run(
             warn(f"continuing {out} after {steps:,} of {total:,} steps")
         if steps >= total:
             return None
-    run = Run(settings, out, origin, state, start, began)
+    run, (on_made, on_start) = Run(settings, out, origin, state, start, began), on
+    on_made(run)
     try:
-        return 0 if loop.train(run, lambda: on_start(run)) else 130
+        return 0 if loop.train(run, on_start) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             saved = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))

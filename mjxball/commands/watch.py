@@ -38,6 +38,9 @@ class Watch:
         self.known: dict[str, Success] = {}
         self.points: list[Point] = []
         self._thread = threading.Thread(target=self._work, daemon=True)
+
+    def start(self) -> None:
+        """Begin with the followers that are known."""
         self._thread.start()
 
     def __call__(self, policy: Path) -> None:
@@ -66,7 +69,11 @@ class Watch:
         self.known = dict(zip(KNOWN[self._track], quick_success(self._track, found), strict=False))
         while job := self._waiting.get():
             path, seconds = job
-            (success,) = quick_success(self._track, [load_policy(path, config)])
+            try:
+                (success,) = quick_success(self._track, [load_policy(path, config)])
+            except InputError as error:  # it commands what is not finite
+                self._say(f"success after {seconds:.0f} s: not measured, {error}")
+                continue
             self.points.append(Point(seconds, success))
             others = "; ".join(f"{name} {_percent(one)}" for name, one in self.known.items())
             self._say(f"success after {seconds:.0f} s: {_percent(success)} % calm/world ({others})")

@@ -213,7 +213,6 @@ def _quick() -> Config:
             policy_layers=(32,),
             horizon=150,
             windows_per_episode=(3, 6),
-            learning_rate=8e-3,
             num_evaluations=4,
         ),
     )

@@ -141,6 +141,7 @@ class Run:
         begun = time.monotonic() if began is None else began
         self._ends = None if minutes is None else begun + 60 * minutes - self.progress.before
         self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
+        self.on_traced: Callable[[], None] | None = None  # is called when XLA compiles, which leaves Python free
         self.on_evaluated: Callable[[Path], None] | None = None  # is called with the policy file after an evaluation
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
         self._clock = ThreadPoolExecutor(1)  # waits for the devices to take the time
@@ -169,6 +170,8 @@ class Run:
         self.progress.begin("compiling", what, "Ctrl-C stops")
         creating = self._state is None
         self._compiled = self.population.compile(creating)
+        if self.on_traced:
+            self.on_traced()
         if creating:
             self.state = self.population.start(self._compiled, self.origin["seed"])
             if self._policies:

@@ -57,6 +57,7 @@ def test_a_watch_says_the_newest_and_writes_all(
     monkeypatch.setattr(watch, "quick_success", success)
     said = list[str]()
     watched = Watch("pair", 0.0, said.append)
+    watched.start()
     assert begun.wait(20)
     for name in ("sac", "paper", "balance"):  # while the known followers fly; only the last is still of interest
         watched(shipped_policy(name))
