@@ -34,7 +34,7 @@ GRADIENT = "--gradient.impulse_response 0 --gradient.gradient_steps 2 --gradient
 SHORTER = {
     "train.py balance": GRADIENT,
     "train.py --algorithm sac": TRAINING,
-    "train.py --distributed": TRAINING,
+    "train.py transport --distributed": TRAINING,
     "train.py --plant": TRAINING,
     "eval.py bench": "--tracks pair",
     "eval.py figures": "--only speeds --physics newton-euler",
@@ -115,11 +115,12 @@ def test_the_block_says_what_the_first_training_is_worth(
 ) -> None:
     record = {"median": {"policy": 99.6, "calm": 0.625, "world": 0.4}, "rows": [{"seed": 0}, {"seed": 1}, {"seed": 0}]}
     (tmp_path / "first.txt").write_text(json.dumps(record))
-    monkeypatch.setattr(readme, "FIRST", tmp_path / "first.txt")
+    sentence = next(iter(readme.FIRST.values()))
+    monkeypatch.setattr(readme, "FIRST", {tmp_path / "first.txt": sentence})
     usual = {"pair": {"calm": results(), "world": results(late_error_90=0.018)}}
     text = entered(**dict.fromkeys(("pid", "lqg", "sac"), usual))
     assert "\nClassical followers lead in 0 of 2 cells.\n" in text  # a draw
-    assert "The training below succeeds in 62/40 % after 100 s on two cores, medians of 2 seeds." in text
+    assert "The training below succeeds in 62/40 % after 100 s on two cores, medians of 2 seeds;" in text
 
 
 def needed(extra: str) -> set[str]:

@@ -65,6 +65,20 @@ def lost() -> Iterator[tuple[str, Numbers]]:
         yield f"`{row['follower']}`, {row['condition']}", [*shares, *peaks]
 
 
+def first() -> Iterator[tuple[str, Numbers]]:
+    columns = {"policy": 1, "command": 1, "calm": 100, "world": 100}
+    found = measured("first_command")
+    for row in found["rows"]:
+        warm = ", warm" if row["cache"] == "warm" else ""
+        yield f"seed {row['seed']}{warm}", [scale * row[name] for name, scale in columns.items()]
+    (sac,) = measured("first_command_sac")["rows"]
+    yield "--algorithm sac", [scale * sac[name] for name, scale in columns.items()]
+    for name in ("lqg", "balance"):
+        entry = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())
+        counts = [entry["tracks"]["pair"][one] for one in ("calm", "world")]
+        yield name, [100 * one["succeeded"] / one["flights"] for one in counts]
+
+
 def training() -> Iterator[tuple[str, Numbers]]:
     for place, name in (("one H200", "training_h200"), ("two cores: `train", "training_2_cores")):
         found = measured(name)["summary"]
@@ -131,6 +145,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Ten minutes": ("results", minutes),
     "Beyond the tracks": ("results", beyond),
     "A lost drone": ("results", lost),
+    "The first command": ("results", first),
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),
     "Other trainers": ("gym", trainers),

@@ -89,7 +89,7 @@ def assert_same_policies(first: Path, second: Path) -> None:
 def test_preempted_and_requeued_job_resumes_to_the_same_bits(cluster: Cluster, whole: Path, tmp_path: Path) -> None:
     """A job of higher priority puts it off; then SIGTERM reaches its step, as at the end of its time."""
     run = tmp_path / "run"
-    settings = {"balance --num-seeds 8 --physics newton-euler": shlex.join(MEMBERS), "runs/many": run}
+    settings = {"balance --algorithm sac --num-seeds 8 --physics newton-euler": shlex.join(MEMBERS), "runs/many": run}
     job = cluster.submit(replaced(scripts()[0], settings), "--nodes=2", "--ntasks-per-node=1")
     wait_until(lambda: steps(run) > 0, LIMIT)
     assert cluster.call("srun", "--partition=high", "--nodes=2", "true").returncode == 0
