@@ -41,6 +41,10 @@ from mjxball.train.environments import Environments
 # The same as in `command_line.environment`: a cached program is found by the flags that it was compiled with.
 if HASTY not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{HASTY} {os.environ.get('XLA_FLAGS', '')}".strip()
+# A training by gradients in this process would leave its two devices to processes that later tests start. (Of this
+# flag programs in the cache do not depend.)
+if xla.CPU_DEVICES.partition("=")[0] not in os.environ["XLA_FLAGS"]:
+    os.environ["XLA_FLAGS"] += f" {xla.CPU_DEVICES.partition('=')[0]}=1"
 if xla.VARIABLE not in os.environ:  # one compilation cache a run: of its workers and of the processes they start
     os.environ[xla.VARIABLE] = tempfile.mkdtemp(prefix="mjxball-cache-")
     atexit.register(shutil.rmtree, os.environ[xla.VARIABLE], ignore_errors=True)

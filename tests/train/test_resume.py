@@ -49,10 +49,27 @@ def complete(run: Path) -> list[int]:
     return sorted(int(path.name) for path in place.iterdir() if path.name.isdigit()) if place.is_dir() else []
 
 
+# A training by gradients, whose environments `train.py` cuts over two devices of the CPU.
+CUT = ["transport", "--algorithm", "gradient", "--timing.episode_steps", "100", "--gradient.num_envs", "8"]
+CUT += ["--gradient.horizon", "10", "--gradient.gradient_steps", str(STEPS // 80 - 1), "--gradient.policy_layers", "8"]
+CUT += ["--gradient.num_evaluations", "5"]
+
+
 @pytest.mark.slow
 def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: Path) -> None:
-    run = tmp_path / "killed"
-    child = launch(["--out", str(run), *tiny()])
+    killed_and_resumed(tiny(), whole, tmp_path / "killed")
+
+
+@pytest.mark.slow
+def test_killed_run_on_two_devices_too(tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    assert launch(["--out", str(whole), *CUT]).wait(timeout=240) == 0
+    assert json.loads((whole / "config.json").read_text())["parts"] == 2
+    killed_and_resumed(CUT, whole, tmp_path / "killed")
+
+
+def killed_and_resumed(settings: list[str], whole: Path, run: Path) -> None:
+    child = launch(["--out", str(run), *settings])
     deadline = time.monotonic() + 120
     while not complete(run) and child.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
