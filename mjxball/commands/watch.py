@@ -32,7 +32,7 @@ class Watch:
     """Flies policies in a thread of its own, which ends with the process: Ctrl-C waits for no flight."""
 
     def __init__(self, track: str, began: float, say: Callable[[str], None]):
-        """`began`: `time.monotonic` when the command did. `say` is called with a sentence for every policy."""
+        """`began`: monotonic time when the command did [s]. `say` is called with a sentence for every policy."""
         self._track, self._began, self._say = track, began, say
         self._waiting: queue.Queue[tuple[Path, float] | None] = queue.Queue()
         self.known: dict[str, Success] = {}

@@ -112,7 +112,7 @@ class Run:
 
         `origin` holds seed, physics, seeds (number of members) and sweep, and goes into the metadata of the policy. A
         new run starts from the policy `origin["start_from"]` if there is one, or each member from its entry of a list.
-        With `origin["minutes"]` it takes as many steps as it can in that time since `began` (`time.monotonic`).
+        With `origin["minutes"]` it takes as many steps as it can in that time since `began`, a monotonic time [s].
         """
         self.config, self.out = config, out
         self._starts = starts_of(origin)

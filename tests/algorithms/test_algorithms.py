@@ -371,11 +371,11 @@ def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:
     [
         (["--algorithm", "gradient", "--physics", "mjx"], "newton-euler"),
         (["--algorithm", "ppo", "--sac.tau", "0.1"], "--sac.tau is a setting of sac"),
-        (["--gradient.horizon", "10"], "--algorithm gradient"),
+        (["--algorithm", "sac", "--gradient.horizon", "10"], "--algorithm gradient"),
         (["--algorithm", "td3"], "sac, ppo, gradient, package.module:Name"),
         (["--algorithm", "ppo", "--ppo.minibatches", "7"], "ppo.minibatches"),
         (["--algorithm", "ppo", "--ppo.activation", "swish"], "unrecognized arguments: --ppo.activation"),
-        (["--start-from", TRANSPORT], "--start-from needs --algorithm gradient"),
+        (["transport", "--start-from", TRANSPORT], "--start-from needs --algorithm gradient"),
         (["--algorithm", "gradient", "--start-from", "none.npz"], "none.npz"),
         (["paper", "--algorithm", "gradient", "--start-from", shipped_policy("universal")], "follower."),
         (

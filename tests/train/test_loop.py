@@ -20,7 +20,7 @@ class Devices:
     def __init__(self, seconds: float, cost: Callable[[int], float], done: int = 0, total: int = 500):
         self.seconds, self.cost, self.done, self.total = seconds, cost, done, total
         self.now, self.environments, self.rows, self.saves = 0.0, WORLDS, list[dict[str, Any]](), 0
-        self.progress = SimpleNamespace(show=self.rows.append)
+        self.progress, self.on_evaluated = SimpleNamespace(show=self.rows.append), None
         schedule = SimpleNamespace(num_evaluations=5)
         algorithm = SimpleNamespace(steps_per_collect=WINDOW)
         program = SimpleNamespace(
