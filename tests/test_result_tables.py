@@ -62,7 +62,8 @@ def lost() -> Iterator[tuple[str, Numbers]]:
     for row in measured("lost")["rows"]:
         shares = [100 * row[name] / row["flights"] for name in ("in_air", "below_peak")]
         peaks = [None if row[name] is None else 1e3 * row[name] for name in ("peak", "whole_late_90")]
-        yield f"`{row['follower']}`, {row['condition']}", [*shares, *peaks]
+        cost = [row["rotor_power"], 100 * row["rotor_limit_share"]]
+        yield f"`{row['follower']}`, {row['condition']}", [*shares, *peaks, *cost]
 
 
 def first() -> Iterator[tuple[str, Numbers]]:
