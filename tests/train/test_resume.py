@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import STEPS, tiny
 from command_line import environment as child_environment
+from command_line import tiny
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS, Checkpoints
@@ -51,7 +51,7 @@ def complete(run: Path) -> list[int]:
 
 # A training by gradients, whose environments `train.py` cuts over two devices of the CPU.
 CUT = ["transport", "--algorithm", "gradient", "--timing.episode_steps", "100", "--gradient.num_envs", "8"]
-CUT += ["--gradient.horizon", "10", "--gradient.gradient_steps", str(STEPS // 80 - 1), "--gradient.policy_layers", "8"]
+CUT += ["--gradient.horizon", "10", "--gradient.gradient_steps", "1499", "--gradient.policy_layers", "8"]
 CUT += ["--gradient.num_evaluations", "5"]
 
 
@@ -78,7 +78,7 @@ def killed_and_resumed(settings: list[str], whole: Path, run: Path) -> None:
     assert child.returncode == -signal.SIGKILL, "the run ended before it could be killed"
     kept = complete(run)
     assert kept
-    assert kept[-1] < STEPS
+    assert kept[-1] < complete(whole)[-1]
     (run / CHECKPOINTS / f"{kept[-1] + 32}.orbax-checkpoint-tmp").mkdir()  # as a write cut short leaves it
     again = launch(["--resume", str(run)])
     output = again.communicate(timeout=240)[0]
