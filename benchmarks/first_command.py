@@ -1,8 +1,8 @@
 """How good the follower of README's first command is, and when: `train.py` for some seeds, each with an empty cache.
 
 A row has the seconds of the whole command, those until its follower was written, and the share of the flights of draw 0
-of mjxball-bench, track pair, in which the follower succeeds. What follows `--` goes to `train.py`. `--warm` repeats the
-first seed with the cache that it left.
+of mjxball-bench, track pair, in which the follower succeeds, with power and time with a rotor at its limit. What
+follows `--` goes to `train.py`. `--warm` repeats the first seed with the cache that it left.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from harness import ROOT, Row, arguments, follower_of, medians, say, write
 from mjxball import running
 from mjxball.bench.draw import groups_of
-from mjxball.bench.quick import success
+from mjxball.bench.quick import summaries
 
 TRACK = "pair"
 
@@ -26,12 +26,13 @@ TRACK = "pair"
 def main(given: Sequence[str] | None = None) -> int:
     """Train, fly, print, write."""
     given = list(sys.argv[1:] if given is None else given)
-    ours, _, more = (" ".join(given) + " ").partition("-- ")
+    cut = given.index("--") if "--" in given else len(given)
+    more = given[cut + 1 :]
     parser = arguments(__file__, __doc__)
     parser.add_argument("--seeds", type=int, default=5, metavar="N")
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--warm", action="store_true", help="then the first seed again, with its cache")
-    options = parser.parse_args(ours.split())
+    options = parser.parse_args(given[:cut])
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as place:
         seeds = [options.first + number for number in range(options.seeds)]
@@ -39,12 +40,12 @@ def main(given: Sequence[str] | None = None) -> int:
             warm = number >= len(seeds)
             out, cache = Path(place) / f"run{number}", Path(place) / f"cache{0 if warm else number}"
             rows.append({"seed": seed, "cache": "warm" if warm else "empty"})
-            rows[-1] |= trained(seed, out, cache, more.split())
+            rows[-1] |= trained(seed, out, cache, more)
             say(rows[-1])
     cold = [row for row in rows if row["cache"] == "empty"]
     median = medians(cold, ("command", "policy", "calm", "world"))
     say({"median": "", **median})
-    write(options.json, {"track": TRACK, "arguments": more.split(), "rows": rows, "median": median})
+    write(options.json, {"track": TRACK, "arguments": more, "rows": rows, "median": median})
     return 0
 
 
@@ -57,8 +58,12 @@ def trained(seed: int, out: Path, cache: Path, more: Sequence[str]) -> Row:
     whole = time.monotonic() - began
     written = (out / "policy.npz").stat().st_mtime - started
     (group,) = groups_of(TRACK, 0)
-    (found,) = success(group, [follower_of(str(out / "policy.npz"), group.config)])
-    return {"command": whole, "policy": written, **found}
+    (found,) = summaries(group, [follower_of(str(out / "policy.npz"), group.config)])
+    row: Row = {"command": whole, "policy": written}
+    for condition, own in found.items():
+        row |= {condition: own["succeeded"] / own["flights"]}
+        row |= {f"{condition} {name}": own[name] for name in ("rotor_power", "rotor_limit_share")}
+    return row
 
 
 if __name__ == "__main__":

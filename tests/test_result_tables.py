@@ -72,12 +72,17 @@ def first() -> Iterator[tuple[str, Numbers]]:
     for row in found["rows"]:
         warm = ", warm" if row["cache"] == "warm" else ""
         yield f"seed {row['seed']}{warm}", [scale * row[name] for name, scale in columns.items()]
+    own, cost = found["again"], {"rotor_power": 1, "rotor_limit_share": 100}
+    costs = [scale * own[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "world")]
+    yield "seed 0, again", [100 * own["calm"], 100 * own["world"], *costs]
     (sac,) = measured("first_command_sac")["rows"]
     yield "--algorithm sac", [scale * sac[name] for name, scale in columns.items()]
-    for name in ("lqg", "balance"):
+    for name in ("lqg", "lqg-world", "balance"):
         entry = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())
         counts = [entry["tracks"]["pair"][one] for one in ("calm", "world")]
-        yield name, [100 * one["succeeded"] / one["flights"] for one in counts]
+        shares = [100 * one["succeeded"] / one["flights"] for one in counts]
+        costs = [scale * one[key] for key, scale in cost.items() for one in counts]
+        yield f"`{name}`", [*shares, *costs]
 
 
 def training() -> Iterator[tuple[str, Numbers]]:

@@ -7,18 +7,19 @@ this process: what a follower may know is not enforced, as `eval.py bench` does.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from mjxball.bench import CONDITIONS
-from mjxball.bench.draw import QUICK_TRACKS, Group, quick_group
+from mjxball.bench.draw import QUICK_TRACKS, Flight, Group, quick_group
 from mjxball.bench.evaluation import with_seed
 from mjxball.bench.flying import ENGINE
-from mjxball.bench.success import reasons
+from mjxball.bench.success import reasons, summary
 from mjxball.bench.tracks import TRACKS
 from mjxball.config import Config
 from mjxball.control.followers import Follower
-from mjxball.evaluate.metrics import fly_and_measure
+from mjxball.evaluate.metrics import Metrics, fly_and_measure
 
 KEY = "quick"  # of the noise
 Success = dict[str, float]  # share of the flights of each condition
@@ -35,23 +36,25 @@ def quick_track(config: Config) -> str | None:
 
 def quick_success(track: str, followers: Sequence[Follower]) -> list[Success]:
     """Success of each of `followers`, flown together, in the few flights of `track`."""
-    return success(quick_group(track), followers)
+    found = summaries(quick_group(track), followers)
+    return [{name: own["succeeded"] / own["flights"] for name, own in one.items()} for one in found]
 
 
-def success(group: Group, followers: Sequence[Follower]) -> list[Success]:
-    """Success of each of `followers`, flown together, in the flights of `group`."""
+def summaries(group: Group, followers: Sequence[Follower]) -> list[dict[str, dict[str, Any]]]:
+    """`success.summary` by condition of each of `followers`, flown together, in the flights of `group`."""
     config, flights = group
     scenarios = [with_seed(one, KEY, 0) for one in flights]
     radii, deadlines = (np.array([getattr(one, name) for one in flights]) for name in ("radius", "deadline"))
     repeated = (np.tile(values, len(followers)) for values in (radii, deadlines))
     _, metrics = fly_and_measure(config, [(one, scenarios) for one in followers], ENGINE, *repeated)
-    found: list[Success] = []
+    found = []
     for begin in range(0, len(metrics), len(flights)):
-        own = [not reasons(one, late) for one, late in zip(metrics[begin:], deadlines, strict=False)]
-        found.append(
-            {
-                name: float(np.mean([good for good, one in zip(own, flights, strict=True) if one.condition == name]))
-                for name in CONDITIONS
-            }
-        )
+        own = list(zip(metrics[begin : begin + len(flights)], flights, strict=True))
+        parts = {name: [pair for pair in own if pair[1].condition == name] for name in CONDITIONS}
+        found.append({name: _summary(part) for name, part in parts.items()})
     return found
+
+
+def _summary(flown: Sequence[tuple[Metrics, Flight]]) -> dict[str, Any]:
+    failures = [reasons(metrics, flight.deadline) for metrics, flight in flown]
+    return summary([metrics for metrics, _ in flown], failures, [flight.oracle_arrival for _, flight in flown])

@@ -89,7 +89,8 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
 def chosen(options: argparse.Namespace) -> tuple[str, str]:
     """(preset, algorithm) of a command that may leave out either."""
     swept = read_json(options.sweep, "sweep file") if options.sweep else {}
-    sections = {str(path).partition(".")[0] for path in (*_given(options), *swept)}
+    settings = [*_given(options), *(swept if isinstance(swept, dict) else ())]  # `read_sweep` refuses another sweep
+    sections = {path.partition(".")[0] for path in settings}
     algorithm = options.algorithm or next((one for one in ALGORITHMS if one in sections), None)
     if algorithm is None and (options.env or options.physics == "mjx"):  # of which no gradient is known
         algorithm = "sac"

@@ -57,7 +57,7 @@ class Population:
     Member k has seed `seed + k` and the k-th value of every swept setting. In one process, members are distributed over
     its devices if these divide their number, else all use the first device. With several processes (see `processes`),
     members are distributed over all devices, and if there are fewer members, each member's environments are too; in one
-    process also those of an algorithm that prefers the CPU, over the CPU's devices, where their number allows it.
+    process also those of an algorithm that says what is `averaged`, over the CPU's devices, if their number allows it.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Population:
         if devices is None:
             devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
         together, cores = jax.process_count() > 1, jax.default_backend() == "cpu"
-        may_split = together or (cores and getattr(extensions.algorithm, "prefers_cpu", False))
+        may_split = together or (cores and hasattr(extensions.algorithm, "averaged"))
         groups, parts = grid(members, len(devices), split=may_split)
         try:
             self.program = self._program(parts)
@@ -261,16 +261,10 @@ class Population:
 
     def _averaged(self, state: TrainState) -> list[int]:
         """Numbers of the arrays of `state` that differ between parts after `collect`; see `Shards`."""
-        names: Any = self.program.algorithm
-        flags = state._replace(
-            algorithm=type(state.algorithm)(
-                *(
-                    jax.tree.map(lambda _, name=name: name in names.averaged, value)
-                    for name, value in zip(state.algorithm._fields, state.algorithm, strict=True)
-                )
-            ),
-            **{name: jax.tree.map(lambda _: False, getattr(state, name)) for name in ("envs", "key", "steps", "total")},
-        )
+        algorithm: Any = self.program.algorithm
+        flags = jax.tree.map(lambda _: False, state)
+        differ = {name: jax.tree.map(lambda _: True, getattr(state.algorithm, name)) for name in algorithm.averaged}
+        flags = flags._replace(algorithm=flags.algorithm._replace(**differ))
         return [number for number, flag in enumerate(jax.tree.leaves(flags)) if flag]
 
     def evaluation_envs(self, compiled: Compiled) -> Any:

@@ -9,6 +9,7 @@ import hashlib
 import importlib.metadata
 import io
 import json
+import math
 import os
 import platform
 import subprocess
@@ -164,6 +165,9 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     sound = _is_whole(record["seed"], 0, MAX_SEED) and _is_whole(record["seeds"], 1, MOST_MEMBERS)
     if not sound or record["physics"] not in TRAINING_ENGINES:
         raise InputError(f"{path} has no sound seed, seeds or physics")
+    minutes = record.get("minutes")
+    if minutes is not None and not (isinstance(minutes, int | float) and 0 < minutes < math.inf):
+        raise InputError(f"{path} has no sound minutes")
     if record["sweep"] is not None:
         record["sweep"] = check_sweep(record["sweep"], record["seeds"], configs.validate(config), str(path))
     if record.pop("config_hash", None) != configs.config_hash(settings):

@@ -43,9 +43,7 @@ def test_followers_flown_together_succeed_as_each_alone() -> None:
     assert together[2]["world"] < 0.5
 
 
-def test_a_watch_says_the_newest_and_writes_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_watch_says_the_newest_and_writes_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, go, flown = threading.Event(), threading.Event(), list[list[str]]()
 
     def success(track: str, followers: Any) -> list[dict[str, float]]:

@@ -218,6 +218,9 @@ def test_a_run_by_the_clock_is_continued_for_the_time_that_is_left(
     before = rows_of(tmp_path / "run")
     origin = json.loads(place.read_text())
     assert origin["minutes"] == 5
+    place.write_text(json.dumps({**origin, "minutes": "five"}))
+    assert call(main, ["--resume", tmp_path / "run"]) == 2
+    assert "no sound minutes" in capsys.readouterr().err
     place.write_text(json.dumps({**origin, "minutes": 1e-3}))
     assert call(main, ["--resume", tmp_path / "run"]) == 0
     rows = rows_of(tmp_path / "run")
@@ -267,6 +270,7 @@ BAD_ARGUMENTS = {
     "noise of a billion deviations": ["--scenario.noise", "0,1e9"],
     "a load that moves at 1e9 rad/s": ["--scenario.cg_speed", "0,1e9"],
     "a seed of 400 digits": ["--seed", "9" * 400],
+    "a sweep of no settings": ["--seeds", 2, "--sweep", "five.json"],
     "no time": ["--minutes", 0],
     "no number of minutes": ["--minutes", "nan"],
     "a year": ["--minutes", 525600],
@@ -287,6 +291,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     record = {"config": configs.to_dict(configs.preset("transport")), "seed": 0, "physics": "mjx"}
     (tmp_path / "unborn" / "config.json").write_text(json.dumps(record))
     (tmp_path / "note.txt").write_text("a note")
+    (tmp_path / "five.json").write_text("5")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
