@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.custom_batching
 import jax.numpy as jnp
 import numpy as np
 
@@ -41,11 +42,24 @@ def fresh_layers(key: Array, inputs: int, units: int, sizes: Sequence[int]) -> d
     return layers
 
 
+def _fresh_square(key: Array, units: int) -> Array:
+    """Orthogonal matrix (units, units) times `RECURRENT_GAIN`.
+
+    One after the other under `vmap`. jaxlib's QR factorisation shares the matrices of a batch among the threads of
+    XLA's pool and waits for them in one of these: as many batches as threads at once wait for ever.
+    """
+
+    @jax.custom_batching.sequential_vmap
+    def square(key: Array) -> Array:
+        return jax.nn.initializers.orthogonal(RECURRENT_GAIN)(key, (units, units))
+
+    return square(key)
+
+
 def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
     """Initial GRU: orthogonal recurrent weights, time constants log-uniform in 1.5 to 150 control steps."""
     kernel, recurrent, memory = jax.random.split(key, 3)
-    square = jax.nn.initializers.orthogonal(RECURRENT_GAIN)
-    blocks = [square(block_key, (units, units)) for block_key in jax.random.split(recurrent, 3)]
+    blocks = [_fresh_square(block_key, units) for block_key in jax.random.split(recurrent, 3)]
     low, high = np.log(SHORTEST_MEMORY), np.log(LONGEST_MEMORY)
     steps = jnp.exp(jax.random.uniform(memory, (units,), minval=low, maxval=high))
     return {

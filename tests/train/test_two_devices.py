@@ -64,6 +64,30 @@ def test_every_algorithm_trains_two_members_on_two_devices(engine: str, units: i
     assert done.stdout.splitlines() == [f"{name} trained" for name in algorithms]
 
 
+FRESH = """
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from mjxball.algorithms.recurrent import fresh_layers
+
+each = NamedSharding(Mesh(jax.devices(), ("members",)), PartitionSpec("members"))
+keys = jax.device_put(jax.random.split(jax.random.key(0), 4), each)
+start = jax.jit(jax.vmap(lambda key: fresh_layers(key, 8, 64, (8, 6))), in_shardings=each, out_shardings=each)
+for _ in range(50):
+    jax.block_until_ready(start(keys))
+print("started")
+"""
+
+
+def test_members_on_two_devices_start() -> None:
+    """Four on two cores waited for each other for ever, in the QR factorisations of their initial weights."""
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", FRESH]
+    done = subprocess.run(
+        command, check=False, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=100
+    )
+    assert (done.returncode, done.stdout) == (0, "started\n"), done.stderr[-3000:]
+
+
 CUT = """
 import jax, numpy as np
 from mjxball import config as configs
