@@ -124,33 +124,46 @@ class FirstOrderGradient:
     def start_from(self, state: GradientState, policy: PolicyFile) -> GradientState:
         """`state` with the network and normalisation of `policy`, as NumPy arrays.
 
-        Inputs of critics alone follow the policy's inputs; their rows stay. InputError if the layers' sizes differ.
+        A smaller network gives the same actions: the weights that it has not stay as they are in `state`, but for those
+        from a new unit to one of its own or to an action, which are 0. Inputs of critics alone follow the policy's
+        inputs; their rows stay. InputError if the policy has other inputs or more units.
         """
         seen, units = len(policy.observation_mean), 0 if policy.gru is None else len(policy.gru[1])
-        sizes = (seen + units, *(len(bias) for bias in policy.biases))
-        if sizes[1:] != self._sizes[1:] or sizes[0] > self._sizes[0] or units != self._units:
-            theirs, own = (",".join(map(str, hidden[1:-1])) for hidden in (sizes, self._sizes))
+        theirs, own = [len(bias) for bias in policy.biases[:-1]], self._sizes[1:-1]
+        fits = seen == self._slots.start if units else seen <= self._sizes[0]
+        fits &= units <= self._units and (units > 0) == (self._units > 0) and len(theirs) == len(own)
+        if not fits or any(small > large for small, large in zip(theirs, own, strict=True)):
+            hidden, of_run = (",".join(map(str, sizes)) for sizes in (theirs, own))
             raise InputError(
-                f"the policy to start from has {seen} inputs, {units} recurrent units and hidden layers {theirs}, and "
-                f"the run has {self._sizes[0] - self._units}, {self._units} and {own}; say "
-                f"--gradient.policy_layers {theirs} --follower.recurrent_units {units}"
+                f"the policy to start from has {seen} inputs, {units} recurrent units and hidden layers {hidden}, and "
+                f"the run has {self._sizes[0] - self._units}, {self._units} and {of_run}; say "
+                f"--gradient.policy_layers {hidden} --follower.recurrent_units {units}, or more"
             )
         scale = np.asarray(policy.observation_scale, np.float64)
         deviation = np.where(scale > 0, np.maximum(1 / np.where(scale > 0, scale, 1.0), LEAST_DEVIATION), 1.0)
         mean, factor = np.asarray(policy.observation_mean, np.float64), (deviation * scale)[:, None]
-        kernels = [np.array(state.layers[f"hidden_{number}"]["kernel"]) for number in range(len(policy.weights))]
-        kernels[0][:units] = policy.weights[0][:units]
-        kernels[0][units : units + seen] = policy.weights[0][units:] * factor
-        kernels[1:] = policy.weights[1:]
-        layers: dict[str, Any] = {
-            f"hidden_{number}": {"kernel": np.asarray(kernel, np.float32), "bias": np.asarray(bias, np.float32)}
-            for number, (kernel, bias) in enumerate(zip(kernels, policy.biases, strict=True))
-        }
+        layers = jax.tree.map(np.array, state.layers)
+        last = len(theirs)
+        for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+            layer, columns = layers[f"hidden_{number}"], len(bias)
+            if number == 0:  # a GRU's state, then inputs
+                parts = [(self._units, weight[:units]), (seen, weight[units:] * factor)]
+            elif number == last:  # the layer below, then a GRU's state
+                parts = [(own[-1], weight[: theirs[-1]]), (self._units, weight[theirs[-1] :])]
+            else:
+                parts = [(own[number - 1], weight)]
+            start = 0
+            for rows, known in parts:
+                layer["kernel"][start : start + rows, :columns] = _padded(known, rows)
+                start += rows
+            layer["bias"][:columns] = bias
         if policy.gru is not None:
             kernel, recurrent, bias = policy.gru
-            layers["gru"] = {"kernel": np.asarray(kernel * factor, np.float32), "recurrent": recurrent, "bias": bias}
-        if ESTIMATE in state.layers:
-            layers[ESTIMATE] = state.layers[ESTIMATE]
+            own_gru = layers["gru"]
+            for name, known in (("kernel", kernel * factor), ("recurrent", recurrent), ("bias", bias[None])):
+                gates = own_gru[name].reshape(-1, 3, self._units)
+                gates[..., :units] = _padded(known.reshape(-1, 3, units), len(gates))
+                own_gru[name] = gates.reshape(own_gru[name].shape)
         means, squares = np.zeros(self._sizes[0], np.float32), np.ones(self._sizes[0], np.float32)
         means[:seen], squares[:seen] = mean, mean**2 + deviation**2
         return state._replace(layers=layers, mean=means, square=squares, seen=np.ones((), np.float32))
@@ -318,6 +331,11 @@ class FirstOrderGradient:
                 f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
                 "make it a multiple"
             )
+
+
+def _padded(known: np.ndarray, rows: int) -> np.ndarray:
+    """(rows, ...) array that begins with `known`, with zeros below."""
+    return np.concatenate([known, np.zeros((rows - len(known), *known.shape[1:]), known.dtype)])
 
 
 def begins_episode(turn: Any, windows: Any, lengths: Sequence[int]) -> Any:

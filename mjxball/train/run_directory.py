@@ -103,7 +103,10 @@ def _is_whole(value: Any, low: int, high: int) -> bool:
 
 
 def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
-    """The policy file `start["policy"]`; InputError unless it has `start["sha256"]` and the follower of `config`."""
+    """The policy file `start["policy"]`; InputError unless it has `start["sha256"]` and the follower of `config`.
+
+    A recurrent network may have fewer units.
+    """
     path = Path(start["policy"])
     contents = load_file(path)
     if file_hash(path) != start["sha256"]:
@@ -114,6 +117,8 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
         contents = observing_stale(contents)
     trained = {**trained, "stale": contents.metadata.get("stale", False)}  # older configurations do not say it
     trained["privileged_critic"] = needed["privileged_critic"]  # does not matter: critics are not in a policy file
+    if 0 < trained.get("recurrent_units", 0) < needed["recurrent_units"]:
+        trained["recurrent_units"] = needed["recurrent_units"]
     changed = [f"follower.{name}" for name in needed if needed[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")

@@ -342,6 +342,26 @@ def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
     np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)
 
 
+@pytest.mark.parametrize(("units", "layers"), [(11, (9, 5)), (7, (20, 12)), (11, (20, 12))])
+def test_a_larger_network_starts_from_what_a_smaller_one_does(recurrent: Any, units: Any, layers: Any) -> None:
+    """And its new units learn: what they add to the action is 0, its gradient is not."""
+    config, small = recurrent.config, recurrent.contents
+    larger = with_settings(config, follower={"recurrent_units": units}, gradient={"policy_layers": layers})
+    algorithm = FirstOrderGradient(larger, Environments(TransportEnv(larger, "newton-euler"), 4))
+    begun = algorithm.start_from(algorithm.init(jax.random.key(0)), small)
+    again = policy_file(larger, network_interface(larger), algorithm.policy(begun), steps=0)
+    observations = np.random.default_rng(1).normal(size=(50, 18))
+    old, new = (Policy(one, "one", np.float64) for one in (small, again))
+    np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)
+    added = [*range(5, layers[1]), *range(layers[1] + 7, layers[1] + units)]
+    assert added
+    assert len(again.weights[2]) == layers[1] + units
+    assert not again.weights[2][added].any()
+    assert all(weight.any(axis=0).all() for weight in (again.gru[0], *again.weights))
+    with pytest.raises(InputError, match=r"say --gradient\.policy_layers .* --follower\.recurrent_units .*, or more"):
+        FirstOrderGradient(config, Environments(TransportEnv(config, "newton-euler"), 4)).start_from(begun, again)
+
+
 def test_a_run_that_observes_stale_starts_from_a_policy_that_does_not_and_not_the_reverse(tmp_path: Path) -> None:
     path, without = shipped_policy("universal"), preset("universal")
     start, aware = {"policy": str(path), "sha256": file_hash(path)}, with_settings(without, follower={"stale": True})
