@@ -263,7 +263,7 @@ def _team() -> Config:
 
 
 def _universal() -> Config:
-    """One follower for teams of any drones and loads, which knows only where drones are mounted."""
+    """One follower for teams of any drones and loads in the world, which knows only where drones are mounted."""
     large = _large()
     team = apply_overrides(large, read_plant("team6").settings)
     return replace(
@@ -273,26 +273,35 @@ def _universal() -> Config:
         # In the middle of the range of random rigs.
         attitude=Attitude(natural_frequency=(7.0, 7.0, 3.0), damping=0.8, design_object_mass=0.4),
         command=Command(tilt_limit=0.6, vertical_limit=8.0),
-        follower=replace(RECURRENT, recurrent_units=60, action_scale_tilt=0.6, action_scale_vertical=8.0),
+        follower=replace(RECURRENT, recurrent_units=96, stale=True, action_scale_tilt=0.6, action_scale_vertical=8.0),
         scenario=replace(
             large.scenario,
-            team_sizes=(2, 3, 4, 6),
-            cg_speed=(0.1, 6.0),
+            **WORLD,
+            team_sizes=(2, 3, 4, 5, 6),
+            cg_speed=(0.1, 4.0),
             cg_amplitude=(0.0, 0.2),
             cg_width=(0.0, 1.0),
             cg_waypoint_probability=0.3,
-            delay=(0.0, 0.05),
-            estimator_drift=(0.0, 1.0),
+            goal_motion_probability=0.15,
             rotor_lag_scale=(1.0, 1.0),
             mass_known=False,
         ),
         rigs=Rigs(number=4096, mass_step=0.3),
         bounds=Bounds(x_peak=0.02, settling_time=4.0, rmse=0.4),
-        reward=replace(_team().reward, rates=0.5),
-        sac=replace(large.sac, num_envs=528, replay_size=528_000),
-        ppo=Ppo(num_envs=528),
+        reward=replace(_team().reward, rates=0.5, command_change=40.0, rotor_limits=20.0),
+        sac=replace(large.sac, num_envs=600, replay_size=600_000),
+        ppo=Ppo(num_envs=600),
         # For a GPU. Short flights alone let followers drift against each other, long ones alone let them settle late.
-        gradient=replace(TEAM_GRADIENT, num_envs=1100, gradient_steps=2600, windows_per_episode=(3, 12)),
+        gradient=replace(
+            TEAM_GRADIENT,
+            policy_layers=(64,),
+            num_envs=3300,
+            gradient_steps=2300,
+            windows_per_episode=(3, 12),
+            learning_rate_final_ratio=0.01,
+            gradient_decay=0.985,
+            exchanged_memory=0.25,
+        ),
     )
 
 
@@ -302,28 +311,19 @@ def _lost() -> Config:
     return replace(
         universal,
         preset="lost",
-        follower=replace(universal.follower, stale=True),
         scenario=replace(
             universal.scenario,
-            **WORLD,
             team_sizes=(3, 4, 5, 6),
             object_mass=(0.3, 0.9),
+            goal_motion_probability=0.0,
             lost_follower_probability=0.3,
             lost_leader_probability=0.1,
         ),
         rigs=Rigs(),
-        reward=replace(universal.reward, command_change=40.0, rotor_limits=20.0),
         sac=replace(universal.sac, num_envs=560, replay_size=560_000),
         ppo=Ppo(num_envs=560),
         # For two cores, from the weights of `universal`.
-        gradient=replace(
-            universal.gradient,
-            num_envs=112,
-            gradient_steps=1900,
-            learning_rate=3e-3,
-            gradient_decay=0.985,
-            exchanged_memory=0.25,
-        ),
+        gradient=replace(universal.gradient, num_envs=112, gradient_steps=1900, learning_rate=3e-3),
     )
 
 
