@@ -10,7 +10,8 @@ nearest to the flight's mean is taken.
 - For a grid of CG offsets and object masses that one drone can trim: the spectral radius of leader, policy and plant
   over one control step about hover (below 1: small errors die out), the time constant that goes with it, and the
   largest delay of the follower's measurements, in whole control steps, that keeps it below 1. LQG, adaptive beside it.
-- Random feasible flights: CG speed, amplitude, phase, mass, goal, start position, velocity and tilt, all uniform. None
+- A policy for any rig: the hovers of `horizon.RIGS` with the CG at O and `AWAY` off, for delays up to `LATEST`.
+- Otherwise random feasible flights: CG speed, amplitude, phase, mass, goal, start and tilt, all uniform. None
   may fail. The ten with the largest steady-state peak are listed.
 """
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from jax.flatten_util import ravel_pytree
 
 from batch import controller_of, fly_compiled
 from harness import Row, arguments, say, table, write
+from horizon import own_plants
 from mjxball.arrays import Array
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
@@ -37,10 +39,11 @@ from mjxball.control import rotations
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Controller, Follower
 from mjxball.control.observation import OWN_STATE
-from mjxball.evaluate.policies import load_policy
+from mjxball.evaluate.policies import flies_any_rig, load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import jax_repeat, make_plant_step, start_state
+from mjxball.policy import Policy
 from mjxball.running import run_command
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
@@ -55,6 +58,7 @@ NEUTRAL = 1e-6  # a memory that the loop does not use keeps its value: eigenvalu
 CG_OFFSETS, MASSES = (-0.17, -0.1, -0.05, 0.0, 0.05, 0.1, 0.17), (0.1, 0.2, 0.4, 0.6)  # of the pair's hovers
 MARGIN, BELIEVED = 0.15, 0.2  # of what can be trimmed; mass that is believed if it is unknown [kg]
 LONGEST = 10  # control steps of delay that are tried
+AWAY, LATEST = 0.05, 3  # CG off O [m] and longest delay [control steps] of a policy for any rig
 
 
 @dataclass(frozen=True)
@@ -137,7 +141,8 @@ def closed_loop(
     def first(load: Load) -> tuple[PlantState, Any, Array]:
         plant = start_state(config, still, still, still, load.believed_mass, zero)
         observation = loop.observe(plant, goal)
-        return plant, controller.start(observation), jnp.broadcast_to(observation[:OWN_STATE], (delay, OWN_STATE))
+        own = observation[..., :OWN_STATE]
+        return plant, controller.start(observation), jnp.broadcast_to(own, (delay, *own.shape))
 
     def start(load: Load) -> Array:
         return flat(*first(load))[0]
@@ -147,7 +152,7 @@ def closed_loop(
         position, euler, velocity, rates, rotors, memory, older = unflatten(z)
         begin, turn = jnp.zeros((), jnp.int32), rotations.quaternion_from_euler(euler)
         plant = PlantState(position, turn, velocity, rates, rotors, begin, zero, zero, zero)
-        past = jnp.concatenate([loop.observe(plant, goal)[None, :OWN_STATE], older])
+        past = jnp.concatenate([loop.observe(plant, goal)[None, ..., :OWN_STATE], older])
         late = SensorState(SensorSettings(delay), past=past) if delay else ()
         state = LoopState(plant, loop.zero_integral(still), late, jnp.zeros((), bool))
         carry = rollout.Carry(state, loop.observe_by(past[-1], goal), memory)
@@ -212,6 +217,15 @@ def about_hover(config: Config, follower: Follower, cases: list[Any]) -> list[Ro
     return rows
 
 
+def of_rig(path: Path, label: str, config: Config) -> Iterator[Row]:
+    """One row for each CG at rest and delay of a policy for any rig, with the plant's object."""
+    controller, mass = controller_of(load_policy(path, config)), config.plant.object_mass
+    for delay in range(LATEST + 1):
+        for hover in linearised_hovers(config, controller, [(0.0, mass, mass), (AWAY, mass, mass)], delay):
+            row: Row = {"plant": label, "offset": hover.offset, "delay": delay * config.timing.control_period}
+            yield row | {"stable": hover.stable, "radius": hover.radius, "error": hover.error, "swing": hover.swing}
+
+
 def _vector(random: np.random.Generator, size: float) -> tuple[float, float, float]:
     x, y, z = map(float, random.uniform(-size, size, 3))
     return x, y, z
@@ -247,6 +261,11 @@ def main(given: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the random flights")
     parser.add_argument("--unknown", action="store_true", help="the hover thrust believes 0.2 kg, whatever the mass")
     options = parser.parse_args(given)
+    if flies_any_rig(Policy.load(options.policy)):
+        rows = [row for label, setup in own_plants(options.policy) for row in of_rig(options.policy, label, setup)]
+        table(rows)
+        write(options.json, {"hovers": rows})
+        return 0
     config = preset("paper")
     policy = load_policy(options.policy, config)
     cases = grid(config, options.unknown)

@@ -39,12 +39,13 @@ CASES = {
     "thrust -8/+8 %": Surroundings(gains=(0.92, 1.08)),
     "thrust -5/-5 %": Surroundings(gains=(0.95, 0.95)),
 }
-# (drone of `DRONES`, shipped plant, shipped policy) and the classical followers beside it
+# (drone of `DRONES`, shipped plant, shipped policy), and the followers that any of these plants can have
 DRONES = (
     ("2.1", "crazyflie", "flight"),
     ("thrust-upgrade", "crazyflie-thrust-upgrade", "flight-upgrade"),
     ("brushless", "crazyflie-brushless", "flight-brushless"),
 )
+FOR_ANY = ("universal", *CLASSICAL)
 WORST = ("rms", "largest", "sideways", "tilt", "limit", "change", "touchdown")
 
 
@@ -88,11 +89,11 @@ def main(given: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="flights of each (2)")
     options = parser.parse_args(given)
     cases = [
-        (drone, case, follower, plant if follower in CLASSICAL else None)
+        (drone, case, follower, plant if follower in FOR_ANY else None)
         for drone, plant, policy in DRONES
         if not options.drones or drone in options.drones
         for case in options.cases
-        for follower in (policy, *CLASSICAL)
+        for follower in (policy, *FOR_ANY)
     ]
     rows: list[Row] = []
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:

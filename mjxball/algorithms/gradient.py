@@ -126,19 +126,13 @@ class FirstOrderGradient:
 
         A smaller network gives the same actions: the weights that it has not stay as they are in `state`, but for those
         from a new unit to one of its own or to an action, which are 0. Inputs of critics alone follow the policy's
-        inputs; their rows stay. InputError if the policy has other inputs or more units.
+        inputs; their rows stay. `train.run_directory.start_policy` checks the sizes. InputError for other inputs.
         """
         seen, units = len(policy.observation_mean), 0 if policy.gru is None else len(policy.gru[1])
         theirs, own = [len(bias) for bias in policy.biases[:-1]], self._sizes[1:-1]
-        fits = seen == self._slots.start if units else seen <= self._sizes[0]
-        fits &= units <= self._units and (units > 0) == (self._units > 0) and len(theirs) == len(own)
-        if not fits or any(small > large for small, large in zip(theirs, own, strict=True)):
-            hidden, of_run = (",".join(map(str, sizes)) for sizes in (theirs, own))
-            raise InputError(
-                f"the policy to start from has {seen} inputs, {units} recurrent units and hidden layers {hidden}, and "
-                f"the run has {self._sizes[0] - self._units}, {self._units} and {of_run}; say "
-                f"--gradient.policy_layers {hidden} --follower.recurrent_units {units}, or more"
-            )
+        if seen > self._sizes[0] or (units and seen != self._slots.start):
+            inputs = self._slots.start if units else self._sizes[0]
+            raise InputError(f"the policy to start from has {seen} inputs, and the run {inputs}")
         scale = np.asarray(policy.observation_scale, np.float64)
         deviation = np.where(scale > 0, np.maximum(1 / np.where(scale > 0, scale, 1.0), LEAST_DEVIATION), 1.0)
         mean, factor = np.asarray(policy.observation_mean, np.float64), (deviation * scale)[:, None]

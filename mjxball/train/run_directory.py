@@ -105,7 +105,7 @@ def _is_whole(value: Any, low: int, high: int) -> bool:
 def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     """The policy file `start["policy"]`; InputError unless it has `start["sha256"]` and the follower of `config`.
 
-    A recurrent network may have fewer units.
+    Its network may have fewer units in each layer.
     """
     path = Path(start["policy"])
     contents = load_file(path)
@@ -122,6 +122,10 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     changed = [f"follower.{name}" for name in needed if needed[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
+    sizes, own = [len(bias) for bias in contents.biases[:-1]], config.gradient.policy_layers
+    if len(sizes) != len(own) or any(size > most for size, most in zip(sizes, own, strict=True)):
+        layers = ",".join(map(str, sizes))
+        raise InputError(f"{path} has hidden layers {layers}; say --gradient.policy_layers {layers}, or more units")
     return contents
 
 

@@ -358,16 +358,30 @@ def test_a_larger_network_starts_from_what_a_smaller_one_does(recurrent: Any, un
     assert len(again.weights[2]) == layers[1] + units
     assert not again.weights[2][added].any()
     assert all(weight.any(axis=0).all() for weight in (again.gru[0], *again.weights))
-    with pytest.raises(InputError, match=r"say --gradient\.policy_layers .* --follower\.recurrent_units .*, or more"):
-        FirstOrderGradient(config, Environments(TransportEnv(config, "newton-euler"), 4)).start_from(begun, again)
 
 
-def test_a_run_that_observes_stale_starts_from_a_policy_that_does_not_and_not_the_reverse(tmp_path: Path) -> None:
-    path, without = shipped_policy("universal"), preset("universal")
+def test_a_network_starts_from_none_that_is_larger(recurrent: Any, tmp_path: Path) -> None:
+    path = tmp_path / "policy.npz"
+    save_file(path, recurrent.contents)
+    start = {"policy": str(path), "sha256": file_hash(path)}
+    start_policy(start, with_settings(recurrent.config, follower={"recurrent_units": 9}))
+    start_policy(start, with_settings(recurrent.config, gradient={"policy_layers": (9, 6)}))
+    with pytest.raises(InputError, match=r"other settings than the run's: follower\.recurrent_units$"):
+        start_policy(start, with_settings(recurrent.config, follower={"recurrent_units": 6}))
+    for layers in ((9, 4), (9,), (9, 5, 5)):
+        with pytest.raises(InputError, match=r"say --gradient\.policy_layers 9,5, or more units"):
+            start_policy(start, with_settings(recurrent.config, gradient={"policy_layers": layers}))
+
+
+def test_a_run_that_observes_stale_starts_from_a_policy_that_does_not_and_not_the_reverse(
+    recurrent: Any, tmp_path: Path
+) -> None:
+    without, path = recurrent.config, tmp_path / "unaware.npz"
+    save_file(path, recurrent.contents)
     start, aware = {"policy": str(path), "sha256": file_hash(path)}, with_settings(without, follower={"stale": True})
     assert start_policy(start, without).metadata.get("stale") is None
     assert start_policy(start, aware).metadata["stale"] is True
-    contents = noticing_stale(load_file(path))
+    contents = noticing_stale(recurrent.contents)
     config = contents.metadata["config"]
     config = {**config, "follower": {**config["follower"], "stale": True}}
     path = tmp_path / "aware.npz"
@@ -400,7 +414,7 @@ def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:
         (["paper", "--algorithm", "gradient", "--start-from", shipped_policy("universal")], "follower."),
         (
             ["universal", "--algorithm", "gradient", *NARROW, "--start-from", shipped_policy("universal")],
-            "--gradient.policy_layers 48",
+            "--gradient.policy_layers 64",
         ),
         (["--algorithm", "gradient", "--resume", "run", "--start-from", TRANSPORT], "drop"),
     ],
