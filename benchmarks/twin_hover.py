@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import sys
+import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -19,9 +20,12 @@ import numpy as np
 
 from harness import Row, arguments, say, table, write
 from mjxball.control.crazyflie import FULL
-from mjxball.policy import policy_path
+from mjxball.export import in_team
+from mjxball.policy import Policy, policy_path
+from mjxball.policy.file import load_file, save_file
 from mjxball.running import run_command
 from mjxfly.classical import NAMES as CLASSICAL
+from mjxfly.classical import ClassicalFollower
 from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings
 from mjxfly.policy_setup import drone_of, goal_of, load_follower
@@ -51,7 +55,7 @@ WORST = ("rms", "largest", "sideways", "tilt", "limit", "change", "touchdown")
 
 def flown(case: str, follower: str, plant: str | None, seed: int) -> Row:
     """One flight."""
-    one = load_follower(policy_path(follower), None if plant is None else Path(plant))
+    one = of_pair(follower, plant)
     config = FlightController(one).config
     surroundings = replace(CASES[case], seed=seed)
     settings = FlightSettings(seconds=SECONDS, goal=goal_of(config))
@@ -80,10 +84,22 @@ def flown(case: str, follower: str, plant: str | None, seed: int) -> Row:
     }
 
 
+def of_pair(follower: str, plant: str | None) -> Policy | ClassicalFollower:
+    """The follower, of `plant` if it may fly any of them."""
+    path = policy_path(follower)
+    if plant is None or follower in CLASSICAL:
+        return load_follower(path, None if plant is None else Path(plant))
+    with tempfile.TemporaryDirectory() as folder:
+        exported = Path(folder) / f"{follower}.npz"
+        save_file(exported, in_team(load_file(path), follower, Path(plant)))
+        return load_follower(exported)
+
+
 def main(given: Sequence[str] | None = None) -> int:
     """Command line."""
     parser = arguments(__file__, __doc__ or "")
     parser.add_argument("--drones", nargs="+", choices=[name for name, *_ in DRONES], help="kinds (all)")
+    parser.add_argument("--followers", nargs="+", help="some of them (all)")
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="conditions (all)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="flights of each (2)")
@@ -94,6 +110,7 @@ def main(given: Sequence[str] | None = None) -> int:
         if not options.drones or drone in options.drones
         for case in options.cases
         for follower in (policy, *FOR_ANY)
+        if not options.followers or follower in options.followers
     ]
     rows: list[Row] = []
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
