@@ -33,6 +33,14 @@ def stability() -> Iterator[tuple[str, Numbers]]:
     yield f"{stable} of {len(own)}", [*worst, error, found["failed"], *peaks]
 
 
+def modes() -> Iterator[tuple[str, Numbers]]:
+    found = measured("universal_modes")["hovers"]
+    for plant in ("pair", "team3", "team4", "team6"):
+        own = [row for row in found if row["plant"] == plant]
+        stable = [sum(row["stable"] for row in own if row["delay"] == delay) for delay in (0.0, 0.02, 0.04, 0.06)]
+        yield plant, [*stable, 1e3 * max(row["error"] for row in own), 1e3 * max(row["swing"] for row in own)]
+
+
 def minutes() -> Iterator[tuple[str, Numbers]]:
     found = [row for row in measured("horizon")["rows"] if row["seconds"] == 600]
     for name, policy, plant in (
@@ -128,10 +136,10 @@ def twin() -> Iterator[tuple[str, Numbers]]:
     found = measured("twin_hover")["rows"]
     learned = {"2.1": "flight", "thrust-upgrade": "flight-upgrade", "brushless": "flight-brushless"}
     for drone, case in dict.fromkeys((row["drone"], row["case"]) for row in found):
-        names = (learned[drone], "lqg", "lqg-calm", "lqg-world")
+        names = (learned[drone], "universal", "lqg", "lqg-calm", "lqg-world")
         line = case if drone == "2.1" else f"{drone.replace('-', ' ')}, {case}"
         yield line, [1e3 * one(found, drone=drone, case=case, follower=name)["rms"] for name in names]
-    for name in ("flight", "lqg", "lqg-calm", "lqg-world"):
+    for name in ("flight", "universal", "lqg", "lqg-calm", "lqg-world"):
         own = one(found, drone="2.1", case="as delivered", follower=name)
         numbers = [1e3 * own["largest"], 1e3 * own["sideways"], 1e3 * own["change"], own["touchdown"]]
         yield name, numbers
@@ -148,6 +156,7 @@ def onboard() -> Iterator[tuple[str, Numbers]]:
 
 SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Stability": ("results", stability),
+    "Modes of the team at hover": ("archive/rigs", modes),
     "Ten minutes": ("results", minutes),
     "Beyond the tracks": ("results", beyond),
     "A lost drone": ("results", lost),

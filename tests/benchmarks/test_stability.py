@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,13 +13,17 @@ import pytest
 import stability
 from batch import controller_of
 from mjxball.baselines import make_baseline
+from mjxball.cli import plant_setup
 from mjxball.config import Config, preset
+from mjxball.evaluate.policies import load_policy
+from mjxball.policy.file import shipped_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
-from stability import delay_margins, linearised_hovers
+from stability import AWAY, delay_margins, linearised_hovers, of_rig
 
 CASES = [(0.0, 0.2, 0.2), (0.1, 0.2, 0.2), (0.05, 0.4, 0.4)]
+UNIVERSAL, TEAM = shipped_policy("universal"), plant_setup(Path("team6"))
 MISTAKEN = (0.0, 0.25, 0.2)  # the hover thrust believes 0.2 kg
 
 
@@ -74,3 +79,13 @@ def test_the_margin_of_a_case_is_the_last_delay_before_its_first_unstable_one(
     assert delay_margins(paper, controller, [CASES[0]] * 4, longest=3) == [1, -1, 0, 2]
     assert delay_margins(paper, controller, CASES[:1], longest=3) == [1]
     assert asked == [0, 1, 2, 3, 0, 1, 2]  # no further than the first delay that nobody bears
+
+
+@pytest.mark.release
+def test_the_hover_of_a_team_with_delay_is_where_it_flies_to() -> None:
+    (row,) = (row for row in of_rig(UNIVERSAL, "team6", TEAM) if (row["offset"], row["delay"]) == (AWAY, 0.04))
+    start = {"goal": (0.0, 0.0, 0.0), "omega": 0.0, "phase": np.pi / 2, "amplitude": AWAY}
+    scenario = Scenario(**start, seconds=60.0, disturbance=Disturbance(delay=0.04))
+    error = simulate_batch(TEAM, [(load_policy(UNIVERSAL, TEAM), [scenario])], "newton-euler").error[-1, 0]
+    assert row["stable"]
+    assert np.linalg.norm(error) == pytest.approx(row["error"], abs=1e-5)
