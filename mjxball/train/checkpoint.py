@@ -26,8 +26,9 @@ from mjxball.train.run_directory import CHECKPOINTS, read_config
 
 KEEP = 2  # checkpoints kept while training, so that one is left if the newest is damaged
 CHECKSUMS = "checksums"
-# This module reports a damaged checkpoint itself, in one line.
+# This module reports a damaged checkpoint itself, in one line; asyncio reports every other read of it that failed too.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
+logging.getLogger("asyncio").addFilter(lambda record: "_wrap_awaitable" not in record.getMessage())
 
 
 def _ignoring_closed_loop(previous: Callable[[Any], Any]) -> Callable[[Any], Any]:
