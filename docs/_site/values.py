@@ -128,16 +128,9 @@ def oracle_share(track: str) -> str:
     return "/".join(shares)
 
 
+teams = [row for row in results("horizon")["rows"] if (row["policy"], row["seconds"]) == ("universal", 600)]
 ten_minutes = {
-    name: SimpleNamespace(
-        **{
-            key: largest(
-                [row for row in results("horizon")["rows"] if (row["seconds"], row["plant"]) == (600, name)], key
-            )
-            for key in ("command_spread", "rotor_power", "command_spread_at_end", "rotor_power_at_end")
-        }
-    )
-    for name in ("team3", "team4", "team6")
+    key: largest([row for row in teams if row["drones"] > 2], key) for key in ("command_spread", "rotor_power")
 }
 
 delivered = {

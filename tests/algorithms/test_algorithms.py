@@ -22,6 +22,7 @@ from mjxball.algorithms.base import Shards, TrainingPhase
 from mjxball.algorithms.gradient import FirstOrderGradient, begins_episode
 from mjxball.commands.train import main
 from mjxball.config import Config, preset
+from mjxball.control.network import Network
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import Policy
@@ -344,7 +345,7 @@ def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
 
 @pytest.mark.parametrize(("units", "layers"), [(11, (9, 5)), (7, (20, 12)), (11, (20, 12))])
 def test_a_larger_network_starts_from_what_a_smaller_one_does(recurrent: Any, units: Any, layers: Any) -> None:
-    """And its new units learn: what they add to the action is 0, its gradient is not."""
+    """And its new units can learn: what they add to the action is 0, its gradient by their weights is not."""
     config, small = recurrent.config, recurrent.contents
     larger = with_settings(config, follower={"recurrent_units": units}, gradient={"policy_layers": layers})
     algorithm = FirstOrderGradient(larger, Environments(TransportEnv(larger, "newton-euler"), 4))
@@ -357,7 +358,22 @@ def test_a_larger_network_starts_from_what_a_smaller_one_does(recurrent: Any, un
     assert added
     assert len(again.weights[2]) == layers[1] + units
     assert not again.weights[2][added].any()
-    assert all(weight.any(axis=0).all() for weight in (again.gru[0], *again.weights))
+    network = Network(again.weights, again.biases, again.observation_mean, again.observation_scale, again.gru)
+    inputs = np.concatenate([np.random.default_rng(2).normal(size=(50, 27)), np.zeros((50, units))], axis=-1)
+
+    def total(last: Any) -> Any:
+        weights = (*again.weights[:-1], last)
+        return network._replace(weights=weights).like(jnp.asarray(inputs)).outputs(jnp.asarray(inputs))[0].sum()
+
+    slope = jax.grad(total)(jnp.asarray(again.weights[2]))
+    assert np.asarray(slope)[added].any(axis=1).all()
+
+
+def test_a_network_starts_from_none_with_other_inputs(recurrent: Any) -> None:
+    aware = with_settings(recurrent.config, follower={"stale": True})
+    algorithm = FirstOrderGradient(aware, Environments(TransportEnv(aware, "newton-euler"), 4))
+    with pytest.raises(InputError, match="the policy to start from has 27 inputs, and the run 28"):
+        algorithm.start_from(algorithm.init(jax.random.key(0)), recurrent.contents)
 
 
 def test_a_network_starts_from_none_that_is_larger(recurrent: Any, tmp_path: Path) -> None:
