@@ -77,7 +77,8 @@ def own_scenarios(setup: Config, seconds: float) -> list[Scenario]:
 
 def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> list[Row]:
     """One row for each scenario and horizon [s], the shortest first."""
-    policy, rows, first = load_policy(path, setup), [], []
+    policy, rows = load_policy(path, setup), list[Row]()
+    first: list[Metrics] = []
     for seconds in horizons:
         scenarios, lengths = own_scenarios(setup, seconds), (seconds, seconds - LAST)
         found, shorter = (fly_compiled(setup, policy, own_scenarios(setup, length)) for length in lengths)
