@@ -11,13 +11,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from mjxball.bench.quick import Success, quick_success
-from mjxball.control.followers import Follower
+from mjxball.bench.quick import Success, known_success, quick_success
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
-from mjxball.policy.file import shipped_policy
 
-KNOWN = {"pair": ("lqg", "balance"), "crazyflie": ("lqg", "flight")}  # on each track: a baseline, a shipped policy
 STEM = "success"  # of the files in a run's directory eval
 
 
@@ -40,7 +37,7 @@ class Watch:
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def start(self) -> None:
-        """Begin with the followers that are known."""
+        """Begin with what the known followers reach, flown only where that is not stored."""
         self._thread.start()
 
     def __call__(self, policy: Path) -> None:
@@ -55,18 +52,11 @@ class Watch:
         self._thread.join()
 
     def _work(self) -> None:
-        from mjxball.baselines import make_baseline
         from mjxball.bench.draw import quick_group
         from mjxball.evaluate.policies import load_policy
 
         config = quick_group(self._track).config
-        baseline, shipped = KNOWN[self._track]
-        found: list[Follower]
-        try:
-            found = [make_baseline(baseline, config), load_policy(shipped_policy(shipped), config)]
-        except InputError:  # an installation without policies
-            found = [make_baseline(baseline, config)]
-        self.known = dict(zip(KNOWN[self._track], quick_success(self._track, found), strict=False))
+        self.known = known_success(self._track)
         while job := self._waiting.get():
             path, seconds = job
             try:

@@ -163,7 +163,7 @@ class Carrying(NamedTuple):
 
         def run(carried: list[Array], *others: Any) -> list[Array]:
             arrays = [*carried[: self.carried], *others]
-            results = compiled(*[arrays[k] for k in self.reads])
+            results = jax.tree.leaves(compiled(*[arrays[k] for k in self.reads]))
             for k, array in zip(self.writes, results, strict=False):
                 carried[k] = array
             return results[len(self.writes) :]

@@ -198,13 +198,11 @@ class Population:
         """`function` lowered for several devices. It carries the arrays of its first `carried` arguments."""
         leaves, structure = jax.tree.flatten(arguments)
         count = len(jax.tree.leaves(arguments[:carried]))
-        shapes = jax.eval_shape(function, *arguments)
-        placed = jax.tree.leaves(self._placed_shapes(shapes, results))
 
-        def flat(*arrays: Any) -> list[Any]:
-            return jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
+        def flat(*arrays: Any) -> Any:
+            return function(*jax.tree.unflatten(structure, arrays))
 
-        jitted = jax.jit(flat, donate_argnums=range(count), out_shardings=[shape.sharding for shape in placed])
+        jitted = jax.jit(flat, donate_argnums=range(count), **self._results(*results))
         return Carrying(jitted.lower(*leaves), count, range(len(leaves)), range(count))
 
     def start(self, compiled: Compiled, seed: int) -> TrainState:

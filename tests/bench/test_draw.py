@@ -21,7 +21,7 @@ from mjxball.sim.goals import GoalMotion
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
-STORED = tuple(path.stem for path in sorted(store.FOLDER.glob("*.json")))
+STORED = tuple(name for path in sorted(store.FOLDER.glob("*.json")) if not (name := path.stem).endswith("-known"))
 
 
 def flights_of(track: str) -> list[draw.Flight]:
