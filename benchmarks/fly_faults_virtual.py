@@ -7,7 +7,7 @@ apps' own C, compiled by gcc: a dead laptop and a lost heartbeat are faults as w
 
 `--positioning` flies each positioning system of the twin instead, without a fault and with a pose lost: the error of O
 in hover after `SETTLING` seconds. A flow deck, which the runner refuses, flies with its guards wide open. The table in
-docs/positioning.md is made from benchmarks/results/fly_positioning.json.
+docs/hardware.md is made from benchmarks/results/fly_positioning.json.
 """
 
 from __future__ import annotations

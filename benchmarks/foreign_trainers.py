@@ -26,6 +26,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -36,18 +37,13 @@ import numpy as np
 
 from harness import say, table, write
 from mjxball import config as configs
-from mjxball.algorithms.base import PolicyNetwork
 from mjxball.env import TransportEnv
-from mjxball.policy import load_network, save_file
-from mjxball.policy.export import policy_file
-from mjxball.sim.follower import network_interface
+from mjxball.policy import PolicyFile, load_network, save_file
+from mjxball.policy.foreign import from_brax, from_sb3
 from mjxball.xla import enable_compilation_cache
 from training import NO_CACHE, evaluate, launch, until_policy
 
 LAST_RATE = 0.02  # of SB3's learning rates, at the end over the start: linear, as the preset's own
-SAMPLES = 100  # observations of a flight on which the policy file must answer as SB3's model
-ROUNDING = 1e-4  # of an action, in [-1, 1]: float32 through three layers, whose inputs are tens of deviations at most
-TANH_IS_ONE = 20.0  # where it is so in float32: what PPO's unbounded actions are clipped to
 COMMON = {"layers": "64,64", "discount": 0.97}
 SETTINGS: dict[str, dict[str, Any]] = {
     "brax-sac": {"steps": 768_000, "num_envs": 128, "updates": 8, "batch": 256, "replay": 768_000, **COMMON}
@@ -61,7 +57,7 @@ SETTINGS["sbx-sac"] = SETTINGS["sb3-sac"]
 LIBRARIES = {"brax": "brax", "sb3": "stable-baselines3", "sbx": "sbx-rl"}
 OURS = ("train.py-sac", "train.py-ppo")
 EPISODES = 256
-Export = Callable[[int, Any, Any, Any], None]  # environment steps; layers, means, deviations: see `PolicyNetwork`
+Export = Callable[[int, PolicyFile], None]  # environment steps and the policy then
 
 
 class Masked:
@@ -103,7 +99,7 @@ def train_brax(config: configs.Config, options: argparse.Namespace, export: Expo
 
     def snapshot(steps: int, _: Any) -> None:
         if steps:
-            export(steps, newest[0][1]["params"], newest[0][0].mean, newest[0][0].std)
+            export(steps, from_brax(newest[0], config, steps=steps))
 
     acting.Evaluator.run_evaluation = look
     sizes, ppo = options.sizes, config.ppo
@@ -145,68 +141,32 @@ def train_brax(config: configs.Config, options: argparse.Namespace, export: Expo
         )
 
 
-class Worlds:
-    """A `FollowerVectorEnv` with same-step autoreset as what Stable-Baselines3 asks of its `VecEnv`.
-
-    Observations (N, n) have zeros where the preset's networks look away. If `squashed`, actions (N, 3) go through tanh.
-    """
-
-    render_mode = None
-
-    def __init__(self, env: Any, mask: np.ndarray, squashed: bool):
-        import gymnasium
-
-        self._env, self._mask, self._squashed, self._seed = env, mask, squashed, 0
-        self.num_envs, self.observation_space = env.num_envs, env.single_observation_space
-        wide = gymnasium.spaces.Box(-TANH_IS_ONE, TANH_IS_ONE, env.single_action_space.shape, np.float32)
-        self.action_space = wide if squashed else env.single_action_space
-
-    def seed(self, seed: int) -> None:
-        """Of the next `reset`: world i has `seed` + i."""
-        self._seed = seed
-
-    def reset(self) -> np.ndarray:
-        """First observations (N, n)."""
-        return self._env.reset(seed=self._seed)[0] * self._mask
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """Keep `actions` (N, 3) for `step_wait`."""
-        self._actions = np.tanh(actions) if self._squashed else actions
-
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, endings, and what SB3 wants to know of each world that ended."""
-        seen, reward, terminated, truncated, info = self._env.step(self._actions)
-        ended = terminated | truncated
-        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for world in np.flatnonzero(ended):
-            told[world] = {
-                "terminal_observation": info["final_obs"][world] * self._mask,
-                "TimeLimit.truncated": bool(truncated[world]),
-            }
-        return seen * self._mask, reward.astype(np.float32), ended, told
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same for all worlds."""
-        return [getattr(self, attr_name)] * self.num_envs
-
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """No world has a wrapper of its own."""
-        return [False] * self.num_envs
-
-
-def train_sb3(config: configs.Config, options: argparse.Namespace, export: Export) -> None:
-    """Train with Stable-Baselines3 or SBX, `export`, and assert that the policy file answers as the model does."""
+def train_sb3(config: configs.Config, options: argparse.Namespace) -> PolicyFile:
+    """Train with Stable-Baselines3 or SBX."""
     import torch
-    from stable_baselines3.common.vec_env import VecNormalize
+    from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-    from mjxball.gym.vector import FollowerVectorEnv
+    from mjxball.gym.sb3 import FollowerVecEnv
 
     torch.set_num_threads(1)
     is_ppo, ppo = options.trainer == "sb3-ppo", config.ppo
-    worlds = FollowerVectorEnv(options.num_envs, config=config, physics=options.physics, autoreset_mode="SameStep")
     mask = np.array(TransportEnv(config, options.physics).input_mask, np.float32)
+
+    class MaskedWorlds(VecEnvWrapper):
+        """Observations with zeros where the preset's networks look away."""
+
+        def reset(self) -> np.ndarray:
+            return self.venv.reset() * mask
+
+        def step_wait(self) -> Any:
+            seen, reward, ended, infos = self.venv.step_wait()
+            for world in np.flatnonzero(ended):
+                infos[world]["terminal_observation"] *= mask
+            return seen * mask, reward, ended, infos
+
+    worlds = FollowerVecEnv(options.num_envs, config=config, physics=options.physics, tanh=is_ppo)
     # A policy file does not clip what its network sees.
-    env = VecNormalize(Worlds(worlds, mask, is_ppo), norm_reward=is_ppo, gamma=options.discount, clip_obs=np.inf)
+    env = VecNormalize(MaskedWorlds(worlds), norm_reward=is_ppo, gamma=options.discount, clip_obs=np.inf)
     is_sbx = options.trainer == "sbx-sac"
     activation: Any = jax.nn.relu if is_sbx else torch.nn.ReLU
     own: dict[str, Any] = {
@@ -229,52 +189,7 @@ def train_sb3(config: configs.Config, options: argparse.Namespace, export: Expor
     model.learn(options.steps)
     env.training = False
 
-    found = layers_of_flax(model) if is_sbx else layers_of_torch(model, is_ppo)
-    named = {f"hidden_{k}": {"kernel": weight, "bias": bias} for k, (weight, bias) in enumerate(found)}
-    statistics = env.obs_rms
-    export(model.num_timesteps, named, statistics.mean, np.sqrt(statistics.var + env.epsilon))
-
-    network, seen, flown = load_network(options.out), env.reset(), []
-    for _ in range(SAMPLES):
-        flown.append(env.get_original_obs()[0])
-        seen, *_ = env.step(model.predict(seen, deterministic=True)[0])
-    observations = np.stack(flown)
-    answers = model.predict(env.normalize_obs(observations), deterministic=True)[0]
-    apart = np.abs((np.tanh(answers) if is_ppo else answers) - network(observations)).max()
-    print(f"policy file and model are apart by {apart:.1e} on {SAMPLES} observations", flush=True)
-    assert apart < ROUNDING
-
-
-Layers = list[tuple[np.ndarray, np.ndarray]]  # weights (in, out) and biases (out,); the last one's have the deviations
-
-
-def layers_of_torch(model: Any, is_ppo: bool) -> Layers:
-    """The policy of SB3's `model`."""
-    import torch
-
-    if is_ppo:
-        hidden, mean, log_std = model.policy.mlp_extractor.policy_net, model.policy.action_net, model.policy.log_std
-    else:
-        hidden, mean, log_std = model.actor.latent_pi, model.actor.mu, model.actor.log_std
-    found = [(array(part.weight).T, array(part.bias)) for part in hidden if isinstance(part, torch.nn.Linear)]
-    kernel, bias = array(mean.weight).T, array(mean.bias)
-    wide = (np.zeros_like(kernel), array(log_std)) if is_ppo else (array(log_std.weight).T, array(log_std.bias))
-    return [*found, (np.hstack([kernel, wide[0]]), np.hstack([bias, wide[1]]))]
-
-
-def layers_of_flax(model: Any) -> Layers:
-    """The policy of SBX's SAC: the last two of its layers give mean and deviation."""
-    dense = model.policy.actor_state.params["params"]
-    found = [
-        (np.asarray(dense[f"Dense_{k}"]["kernel"]), np.asarray(dense[f"Dense_{k}"]["bias"])) for k in range(len(dense))
-    ]
-    *hidden, mean, log_std = found
-    return [*hidden, (np.hstack([mean[0], log_std[0]]), np.hstack([mean[1], log_std[1]]))]
-
-
-def array(tensor: Any) -> np.ndarray:
-    """PyTorch's `tensor` as NumPy's."""
-    return tensor.detach().numpy()
+    return from_sb3(model, config)
 
 
 def mean_return(network: Callable[[np.ndarray], np.ndarray], config: configs.Config, physics: str) -> float:
@@ -342,17 +257,20 @@ def main() -> None:
     metadata |= {"seed": options.seed, "physics": options.physics}
     started = time.perf_counter()
 
-    def export(steps: int, found: Any, mean: Any, deviation: Any) -> None:
-        mask = jnp.asarray(TransportEnv(config, options.physics).input_mask)
-        learnt = PolicyNetwork(found, jnp.asarray(mean), jnp.asarray(deviation), mask)
-        exported = policy_file(config, network_interface(config), learnt, steps, metadata)
-        if library == "brax":
-            save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
+    def with_origin(policy: PolicyFile) -> PolicyFile:
+        return replace(policy, metadata={**policy.metadata, **metadata})
+
+    def export(steps: int, policy: PolicyFile) -> None:
+        policy = with_origin(policy)
+        save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), policy)
         if steps >= options.steps:
-            save_file(options.out, exported)
+            save_file(options.out, policy)
         print(f"{steps} steps in {time.perf_counter() - started:.0f} s", flush=True)
 
-    (train_brax if library == "brax" else train_sb3)(config, options, export)
+    if library == "brax":
+        train_brax(config, options, export)
+    else:
+        save_file(options.out, with_origin(train_sb3(config, options)))
     print(f"policy: {options.out}", flush=True)
 
 

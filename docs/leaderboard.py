@@ -28,7 +28,7 @@ KINDS = {
     "classical": sorted(CONTROLLERS),
 }
 COSTS = ("success %", "late mm", "limit %", "power", "change mrad")  # columns of the best of each kind
-COLUMNS = ["follower", "", *HEADS, "date, commit"]
+COLUMNS = ["follower", "condition", *HEADS, "date, commit"]
 
 
 @functools.cache
@@ -67,7 +67,7 @@ def best(names: Iterable[str], track: str, condition: str) -> tuple[float, list[
 
 def bests() -> str:
     """The best learned and the best classical follower of each track and condition, and what they cost to fly."""
-    lines = [f"| track | | | follower | {' | '.join(COSTS)} |", f"|{'---|' * (4 + len(COSTS))}"]
+    lines = [f"| track | condition | kind | follower | {' | '.join(COSTS)} |", f"|{'---|' * (4 + len(COSTS))}"]
     for track, own in TRACKS.items():
         for condition in CONDITIONS:
             for kind, names in KINDS.items():

@@ -2,13 +2,16 @@
 """Make the still pictures of the pages: `python docs/pictures.py [NAME ...] [--out DIR]`, all without a name.
 
 The pictures `tutorial-*` come from the commands of docs/tutorial.md, run one after the other in a directory of their
-own: some minutes. `viewer` and `tutorial-report` are screenshots and need a Chromium and Playwright.
+own: some minutes. `viewer`, `tutorial-report` and one of `notebook` are screenshots and need a Chromium and Playwright.
 docs/readme_picture.py makes the moving picture.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
+import contextlib
+import html
 import io
 import json
 import os
@@ -23,10 +26,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from supervisor_picture import state_chart
 
 import leaderboard
 from leaderboard import KINDS
-from mjxball import Policy, Scenario
+from mjxball import Policy, Scenario, simulate
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.bench import CONDITIONS
@@ -35,7 +39,26 @@ from mjxball.evaluate.paper_figures import plot_figure
 from mjxball.evaluate.plots import PANELS, plot_flights
 from mjxball.evaluate.results import fly_scenarios, scenario_title
 from mjxball.evaluate.scenarios import REFERENCE
-from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
+from mjxball.files import write_atomically
+from mjxball.notebook import View
+from mjxball.plant import plant_parameters
+from mjxball.plant.rotors import PLACES, SPIN
+from mjxball.plotting import (
+    BLUE,
+    BROWN,
+    GREEN,
+    INK,
+    OLIVE,
+    PINK,
+    follower_styles,
+    legend_above,
+    line,
+    logarithmic,
+    pyplot,
+    rendered,
+    save,
+    series_styles,
+)
 from mjxball.policy.file import policy_path, shipped_policy
 from mjxfly.gain_design import apply, design
 from mjxfly.log import result_of, without_goal
@@ -46,6 +69,9 @@ REPOSITORY = Path(__file__).parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 X, Y, Z, ERROR, CG, ROLL, PITCH, VERTICAL = PANELS
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
+NOTEBOOK = REPOSITORY / "docs" / "notebooks" / "first_follower.ipynb"
+INKED = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+PRINTED = dict.fromkeys(INKED, "black")  # of a picture on white
 COLOURS_OF_PNG = 256
 WIDTH = 77  # of quoted lines, which fit the page
 
@@ -66,8 +92,69 @@ def copying(out: Path) -> None:
     flights(["copy", "lqg", "transport"], REFERENCE, out / "copying.svg")
 
 
+def cancels(out: Path) -> None:
+    """Page index: the follower's pitch command less the leader's, on top of what cancels the CG."""
+    config = configs.preset("transport")
+    plant, stiffness = config.plant, plant_parameters(config.plant, config.attitude).gains.kp[1]
+    followers = [make_baseline(name, config) for name in ("copy", "lqg")]
+    followers.append(Policy.load(shipped_policy("balance")))
+    looks = follower_styles([one.name for one in followers])
+    with pyplot().rc_context(PRINTED):
+        figure, axis = pyplot().subplots(figsize=(5, 3), layout="constrained")
+        for number, follower in enumerate(followers):
+            flown = simulate(config, follower, REFERENCE, "newton-euler")
+            if not number:
+                needed = -plant.object_mass * plant.gravity * flown.cg_offset / stiffness
+                axis.plot(flown.time, needed, color="0.8", linewidth=6, label="what cancels the CG")
+            less = flown.follower_command[:, 1] - flown.leader_command[:, 1]
+            look, name = line(looks[follower.name]), follower.name
+            if name == "balance":  # with exact sensors it circles by millimetres about its hover
+                axis.plot(flown.time, less, **{**look, "linewidth": 0.6, "alpha": 0.5}, label=name)
+                less, name = np.convolve(less, np.ones(100) / 100, "same"), f"{name}, mean of 2 s"
+            axis.plot(flown.time, less, **look, label=name, zorder=4 - number)
+        axis.set(xlabel="time [s]", ylabel="pitch command [rad],\nfollower less leader", xlim=(5, 44), ylim=(-0.1, 0.1))
+        axis.grid()
+        legend_above(figure, [axis], 2)
+        write_atomically(out / "cancels.svg", on_white(rendered(figure, "svg")))
+
+
+def on_white(picture: bytes) -> bytes:
+    """An SVG with a white background."""
+    return re.sub(rb"(<svg[^>]*>)", rb'\1<rect width="100%" height="100%" fill="white"/>', picture, count=1)
+
+
+def notebook(out: Path) -> None:
+    """What the cells of the notebook print and draw, in `out`/notebooks, which `_site/notebooks.py` shows."""
+    names: dict[str, Any] = {}
+    (out / "notebooks").mkdir(exist_ok=True)
+    with pyplot().rc_context(PRINTED):
+        for cell in json.loads(NOTEBOOK.read_text())["cells"]:
+            if cell["cell_type"] == "code":
+                place, printed = out / "notebooks" / f"{NOTEBOOK.stem}-{cell['id']}", io.StringIO()
+                with contextlib.redirect_stdout(printed):
+                    last = run_cell("".join(cell["source"]), names)
+                if text := printed.getvalue():
+                    write_atomically(place.with_suffix(".txt"), text.encode())
+                for number in pyplot().get_fignums():
+                    drawn = rendered(pyplot().figure(number), "svg")
+                    write_atomically(place.with_suffix(".svg"), on_white(drawn))
+                if isinstance(last, View):
+                    (page,) = re.findall(r'srcdoc="([^"]*)"', last._repr_html_())
+                    with tempfile.TemporaryDirectory() as name:
+                        (Path(name) / "page.html").write_text(html.unescape(page))
+                        screenshot(Path(name) / "page.html", place.with_suffix(".png"), 900, 560)
+
+
+def run_cell(code: str, names: dict[str, Any]) -> Any:
+    """Run the code of a cell in `names`; the value of its last line if that is an expression."""
+    tree = ast.parse(code)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, "cell", "exec"), names)
+    return eval(compile(ast.Expression(last.value), "cell", "eval"), names) if isinstance(last, ast.Expr) else None
+
+
 def flight(out: Path) -> None:
-    """Page getting-started: the flight of its program."""
+    """Page tutorial: the flight of its program."""
     flights(["copy", "balance"], Scenario(omega=1.0, amplitude=0.08), out / "flight.svg", (X, ERROR, PITCH))
 
 
@@ -124,6 +211,11 @@ def crazyflie_gains(out: Path) -> None:
     save(figure, out / "crazyflie-gains.svg")
 
 
+def supervisor(out: Path) -> None:
+    """Page flying: the flight supervisor as a state machine, from its table of transitions."""
+    (out / "supervisor.svg").write_text(state_chart())
+
+
 def learning_curves(out: Path) -> None:
     """Page results: cost of an episode against seconds, from learning_curves_h200.json."""
     found = json.loads((RESULTS / "learning_curves_h200.json").read_text())
@@ -168,6 +260,76 @@ def best(out: Path) -> None:
     panels[0].invert_yaxis()
     legend_above(figure, panels[:1])
     save(figure, out / "best.svg")
+
+
+def frames(out: Path) -> None:
+    """Page model: the pair from above and from its right side, not to scale."""
+    plt = pyplot()
+    figure, (top, side) = plt.subplots(
+        2, 1, figsize=(4.6, 4.65), height_ratios=(3.9, 3.3), layout="constrained", sharex=True
+    )
+    mounts, arm, cg, spin_radius = {"leader": 2.4, "follower": -2.4}, 1.1, 0.7, 0.44
+
+    def arrow(axis: Any, begin: tuple[float, float], end: tuple[float, float], colour: str) -> None:
+        look = {"arrowstyle": "-|>", "color": colour, "lw": 1.8, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 11}
+        axis.annotate("", end, begin, arrowprops=look, zorder=6)
+
+    def label(axis: Any, place: tuple[float, float], words: str, colour: str = "black") -> None:
+        axis.text(*place, words, color=colour, fontsize=11, ha="center", va="center", zorder=7)
+
+    for number, (name, middle) in enumerate(mounts.items()):
+        for rotor, (place, moment) in enumerate(zip(PLACES["plus"], SPIN["plus"], strict=True), start=1):
+            x, y = middle + arm * place[0], arm * place[1]
+            colour = BLUE if moment > 0 else BROWN
+            top.plot([middle, x], [0, y], color=INK, linewidth=2)
+            top.add_patch(plt.Circle((x, y), spin_radius, facecolor="white", edgecolor="0.8", zorder=3))
+            # A rotor turns against the moment that it exerts on its drone.
+            turn = np.radians(np.linspace(150, 390, 40)[::-moment])
+            around = np.array([x + spin_radius * np.cos(turn), y + spin_radius * np.sin(turn)]).T
+            top.plot(*around.T, color=colour, linewidth=1.6, zorder=4)
+            arrow(top, tuple(around[-6]), tuple(around[-1]), colour)
+            label(top, (x, y), str(rotor), colour)
+        arrow(side, (0, -0.3), (middle, -0.3), PINK)
+        label(side, (0.62 * middle, -0.62), f"r{'₀₁'[number]}", PINK)
+        label(top, (middle, 1.9), name)
+        side.plot([middle - arm, middle + arm], [0, 0], color=INK, linewidth=2)
+        for x in (middle - arm, middle, middle + arm):
+            ends, colour = [x - spin_radius, x + spin_radius], BROWN if x == middle else BLUE
+            side.plot(ends, [0.08, 0.08], color=colour, linewidth=3)
+        arrow(side, (middle, 0.1), (middle, 1.1), GREEN)
+        label(side, (middle + 0.36, 0.9), f"T{'₀₁'[number]}", GREEN)
+        label(side, (middle, 1.4), name)
+    for axis, up, corner in ((top, "y", (-0.4, -1.5)), (side, "z", (-4.0, -1.45))):
+        axis.add_patch(plt.Rectangle((-2.4, -0.15), 4.8, 0.3, color="0.85", zorder=0))
+        for word, x, y in (("x", 0.8, 0.0), (up, 0.0, 0.8)):
+            arrow(axis, corner, (corner[0] + x, corner[1] + y), "black")
+            label(axis, (corner[0] + 1.25 * x, corner[1] + 1.25 * y), word)
+        axis.plot([0], [0], "o", color="black", markersize=5, zorder=8)
+        axis.plot([cg], [0], "s", color=OLIVE, markersize=8, zorder=8)
+        label(axis, (0, 0.42), "O")
+        label(axis, (cg, 0.42), "CG", OLIVE)
+        axis.set(xlim=(-4.1, 4.1), aspect="equal")
+        axis.axis("off")
+    arrow(side, (0, 0), (cg, 0), OLIVE)
+    label(side, (0.5 * cg, -0.62), "c", OLIVE)
+    arrow(side, (cg, 0), (cg, -1.3), OLIVE)
+    label(side, (cg + 1.3, -1.2), "load's weight", OLIVE)
+    top.set(ylim=(-1.75, 2.15))
+    side.set(ylim=(-1.65, 1.65))
+    top.set_title("from above: x forward, y left", color="black", fontsize=11)
+    side.set_title("from the right: x forward, z up", color="black", fontsize=11)
+    write_atomically(out / "frames.svg", on_white(rendered(figure, "svg")))
+
+
+def own_rig(out: Path) -> None:
+    """Page own-rig: the plan of its `tri.toml` by `python -m mjxfly.rig.design`."""
+    text = (REPOSITORY / "docs" / "howto" / "own-rig.md").read_text()
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        (rig,) = re.findall(r"^```toml\n(# tri\.toml\n.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+        (place / "tri.toml").write_text(rig)
+        run(shlex.split("python -m mjxfly.rig.design --plant tri.toml --out plan.svg"), place)
+        write_atomically(out / "own-rig.svg", on_white((place / "plan.svg").read_bytes()))
 
 
 def viewer(out: Path) -> None:
@@ -261,18 +423,29 @@ def screenshot(page: Path, path: Path, width: int = 1200, height: int = 800) -> 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
     "best": best,
+    "cancels": cancels,
+    "notebook": notebook,
     "copying": copying,
     "flight": flight,
     "crazyflie-stand": crazyflie_stand,
     "crazyflie-gains": crazyflie_gains,
+    "supervisor": supervisor,
     "learning-curves": learning_curves,
+    "frames": frames,
+    "own-rig": own_rig,
     "viewer": viewer,
     "tutorial": tutorial,
 }
 
 
 MADE = (
-    *(f"{name}.svg" for name in ("best", "copying", "flight", "crazyflie-stand", "crazyflie-gains", "learning-curves")),
+    *(
+        f"{name}.svg"
+        for name in ("best", "cancels", "copying", "flight", "crazyflie-stand", "crazyflie-gains", "learning-curves")
+    ),
+    "supervisor.svg",
+    "frames.svg",
+    "own-rig.svg",
     "viewer.png",
     *(f"tutorial-{name}" for name in ("training.svg", "flight.svg", "report.png", "viewer.png", "rehearsal.svg")),
     *(f"tutorial-{name}.txt" for name in ("training", "results", "export", "rehearsal")),

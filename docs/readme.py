@@ -38,7 +38,9 @@ FIRST = {  # what README trains
     RESULTS / "first_command.json": (
         "The training below succeeds in {shares} % after {seconds} s on two cores, medians of {seeds} seeds;"
     ),
-    RESULTS / "first_command_sac.json": "by the paper's way (`--algorithm sac`, MJX) in {shares} % after {seconds} s.",
+    RESULTS / "first_command_sac.json": (
+        "`--algorithm sac`, the paper's algorithm on MJX, succeeds in {shares} % after {seconds} s."
+    ),
 }
 COLUMNS = (
     "follower",

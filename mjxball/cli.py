@@ -92,7 +92,8 @@ class Formatter(argparse.HelpFormatter):
         return self._folded(super()._format_usage(*given).strip(), 0) + "\n\n"
 
     def _split_lines(self, text: str, width: int) -> list[str]:
-        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+        paragraphs = (" ".join(part.split()) for part in text.split("\n\n"))
+        return [line for part in paragraphs for line in textwrap.wrap(part, width, break_on_hyphens=False)]
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         lines = self._split_lines(text, width - len(indent))

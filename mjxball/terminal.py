@@ -6,15 +6,19 @@ rich takes 40 ms to import, but flax imports it anyway.
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import sys
 import textwrap
+import threading
+import time
 import unicodedata
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 PERIOD = 0.5  # [s] between two redraws
+SOON, QUIET = 0.6, 4.0  # [s] after which `Working` prints its first line, and each other
 GAP = "  "  # between the parts of a line
 LONGEST = 900  # characters of an error message
 Lines = Sequence[Sequence[str]]  # lines, each a list of parts, the most important part first
@@ -137,6 +141,48 @@ class Status:
 
         columns = columns_of(self._stream)
         return Text("\n".join(fitted(parts, columns) for parts in self._shown()), no_wrap=True)
+
+
+class Working:
+    """Says on stderr what a program does, and while that lasts every few seconds how far it is: a context manager.
+
+    At a terminal one line is redrawn and removed at the end, else lines are printed. What takes less than `SOON` passes
+    in silence.
+    """
+
+    def __init__(self, text: str):
+        """`text`: such as "flying 3 followers"."""
+        self._text, self._status, self._share = text, Status(), math.nan
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._report, daemon=True)
+
+    def __call__(self, share: float) -> None:
+        """Note the `share` that is done, 0 to 1."""
+        self._share = share
+
+    def __enter__(self) -> Working:
+        self._began = time.monotonic()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._status.close()
+
+    def _parts(self) -> list[str]:
+        share = [] if math.isnan(self._share) else [f"{self._share:.0%}"]
+        return [self._text, *share, f"{time.monotonic() - self._began:.0f} s"]
+
+    def _report(self) -> None:
+        if self._ended.wait(SOON):
+            return
+        if self._status.live:
+            self._status.show(lambda: [self._parts()])
+            return
+        self._status.row([f"{self._text} ..."])
+        while not self._ended.wait(QUIET):
+            self._status.row(self._parts())
 
 
 def _display(stream: TextIO, render: Callable[[], Any]) -> Any:

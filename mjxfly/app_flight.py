@@ -64,7 +64,7 @@ class OnboardApps:
         except LinkError as error:
             if "no parameter" not in str(error):
                 raise
-            raise InputError(f"the {link.name} has no app on board: see docs/onboard.md") from None
+            raise InputError(f"the {link.name} has no app on board: see docs/hardware.md") from None
         return {name.removeprefix(f"{GROUP}."): value for name, value in found.items()}
 
 

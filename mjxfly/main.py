@@ -111,7 +111,7 @@ def make_parser() -> cli.Parser:
     about = "a live page of the log, for a browser on this machine (a free port)"
     add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
     add("--foxglove", type=int, metavar="PORT", help="--view: for Foxglove too, on this machine alone")
-    about = "the controllers run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
+    about = "the controllers run on the drones (docs/hardware.md); --rehearse: the app's C, with these weights"
     add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
     add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
 

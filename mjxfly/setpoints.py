@@ -37,7 +37,7 @@ HELD_SPEEDS = (0.2, 1.2)  # [m/s] bounds of the speed of a descent with a deadli
 
 @dataclass(frozen=True)
 class ForceCurve:
-    """Force of one motor from p = thrust units / 65535: `quadratic` p^2 + `linear` p [N] (crazyflie.md)."""
+    """Force of one motor from p = thrust units / 65535: `quadratic` p^2 + `linear` p [N] (docs/hardware.md)."""
 
     quadratic: float = 0.0  # [N]
     linear: float = 0.12  # [N] Crazyflie 2.1+ with battery compensation

@@ -1,4 +1,4 @@
-"""The safety supervisor: a pure state machine. `TRANSITIONS` defines it; docs/supervisor.md shows it as a table.
+"""The safety supervisor: a pure state machine. `TRANSITIONS` defines it; docs/flying.md shows it as a table.
 
 A state determines what is sent to both drones. A fault of one drone always brings both down together.
 """

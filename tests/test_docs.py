@@ -26,7 +26,7 @@ PAGES = sorted([REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *DOCS.
 NOTEBOOK = DOCS / "notebooks" / "first_follower.ipynb"
 RUN = [
     "README.md",
-    "docs/getting-started.md",
+    "docs/tutorial.md",
     "docs/view.md",
     *(f"docs/howto/own-{n}.md" for n in ("rig", "model", "reward", "baseline", "environment", "algorithm")),
 ]
@@ -261,6 +261,22 @@ def test_the_notebook_is_stored_without_outputs() -> None:
     )
 
 
+def stored(cell: dict[str, Any], kind: str) -> Path:
+    """The output of a cell of the notebook that the site shows."""
+    return NOTEBOOK.with_name(f"{NOTEBOOK.stem}-{cell['id']}{kind}")
+
+
+def test_stored_outputs_of_the_notebook_are_small_and_of_its_cells() -> None:
+    found = set(NOTEBOOK.parent.glob(f"{NOTEBOOK.stem}-*"))
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    assert found <= {stored(cell, kind) for cell in cells for kind in (".txt", ".svg", ".png")}
+    assert len(found) == 6
+    assert max(path.stat().st_size for path in found) < 150_000
+    assert all(
+        cell["metadata"]["alt"] for cell in cells if not {stored(cell, ".svg"), stored(cell, ".png")}.isdisjoint(found)
+    )
+
+
 @pytest.mark.release
 def test_the_notebook_runs() -> None:
     import nbformat
@@ -274,6 +290,12 @@ def test_the_notebook_runs() -> None:
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     printed = "".join(output.get("text", "") for output in outputs if output.get("name") == "stdout")
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    shown = "".join(stored(cell, ".txt").read_text() for cell in notebook.cells if stored(cell, ".txt").exists())
+    number = r"\d+\.\d+"
+    assert re.sub(number, "", shown) == re.sub(number, "", printed)  # `python docs/pictures.py notebook`
+    assert [*map(float, re.findall(number, shown))] == pytest.approx(
+        [*map(float, re.findall(number, printed))], rel=1e-3, abs=2e-4
+    )
     swayed = {name: float(far) for name, far in re.findall(r"^(\w+) +sways (\S+) m +settles", printed, re.MULTILINE)}
     assert swayed["copy"] > 0.29  # docs/mimicking.md: 0.296 m
     assert max(swayed["lqg"], swayed["transport"]) < 0.01

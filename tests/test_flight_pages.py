@@ -14,7 +14,7 @@ from mjxfly.supervisor import FlightState
 from mjxfly.twin.conditions import POSITIONING
 
 DOCS = REPOSITORY / "docs"
-SUPERVISOR = (DOCS / "supervisor.md").read_text(encoding="utf-8")
+SUPERVISOR = (DOCS / "flying.md").read_text(encoding="utf-8")
 sys.path.append(str(DOCS / "_site"))
 import flight_tables  # noqa: E402
 

@@ -166,7 +166,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Other trainers": ("gym", trainers),
     "Two Crazyflies": ("results", crazyflies),
     "Two Crazyflies ": ("results", twin),
-    "Cost and tests": ("onboard", onboard),
+    "Cost and tests": ("hardware", onboard),
 }
 
 

@@ -6,6 +6,7 @@ import io
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from pseudo_terminal import on_terminal
 
 from mjxball import terminal
 from mjxball.evaluate.results import metric_text
-from mjxball.terminal import fitted, folded, table
+from mjxball.terminal import Working, fitted, folded, table
 
 WIDTHS = (40, 80, 100, 130)
 TRAINING = """
@@ -187,3 +188,18 @@ def test_a_sentence_of_one_thread_is_not_cut_by_another(monkeypatch: pytest.Monk
     terminal.say("leader: connecting")
     terminal.warn("follower: connecting")
     assert pieces == ["leader: connecting\n", "follower: connecting\n"]
+
+
+def test_working_says_what_lasts_and_how_far_it_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Working("thinking"):
+        pass
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(terminal, "SOON", 0.05)
+    monkeypatch.setattr(terminal, "QUIET", 0.05)
+    with Working("flying 2 followers") as working:
+        working(0.25)
+        time.sleep(0.5)
+    first, second, *_ = capsys.readouterr().err.splitlines()
+    assert (first, second) == ("flying 2 followers ...", "flying 2 followers  25%  0 s")

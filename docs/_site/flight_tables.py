@@ -27,7 +27,7 @@ from mjxfly.twin.drone import ACTED
 
 def log_kinds() -> str:
     """The kinds of records in a flight log, and their fields."""
-    lines = ["| kind | when | field | type | what |", "|---|---|---|---|---|"]
+    lines = ["| kind | when | field | type | meaning |", "|---|---|---|---|---|"]
     for name, kind in KINDS.items():
         head = f"`{name}` | {kind.text}"
         for field, (type_, text, required) in kind.fields.items():
@@ -38,11 +38,11 @@ def log_kinds() -> str:
 
 def log_sources() -> str:
     """What is read of bags and of cfclient's files."""
-    lines = ["| topic | type | what is taken |", "|---|---|---|"]
+    lines = ["| topic | type | what is read |", "|---|---|---|"]
     for name, topic in TOPICS.items():
         place = "" if name in (HEADER, RECORD, "tf") else "/DRONE"
         lines.append(f"| `{place}/{name}` | `{topic.type}` | {topic.text} |")
-    lines += ["", "| log variable | what | number | in SI units, or as sent |", "|---|---|---|---|"]
+    lines += ["", "| log variable | quantity | component | factor to SI units, or as sent |", "|---|---|---|---|"]
     for name, variable in VARIABLES.items():
         lines.append(f"| `{name}` | {variable.quantity} | {variable.place + 1} | × {variable.factor:.6g} |")
     return "\n".join(lines)
@@ -78,31 +78,32 @@ def bounds() -> str:
         "fence around the start": f"±{limits.fence_high[0]:g} m, "
         f"height {limits.fence_low[2]:g} .. {limits.fence_high[2]:g} m",
         "tilt of a drone": f"{math.degrees(limits.tilt):.0f} degrees",
-        "tilt of the drone that is heard, in *hold*": f"{math.degrees(limits.hold_tilt):.0f} degrees",
-        "tilt of the stick by both positions": f"{math.degrees(limits.stick_tilt):.0f} degrees",
-        "length of the stick by both positions": f"±{100 * limits.stick_error:.0f} cm",
+        "tilt of the drone whose states arrive, in *hold*": f"{math.degrees(limits.hold_tilt):.0f} degrees",
+        "tilt of the stick, from both positions": f"{math.degrees(limits.stick_tilt):.0f} degrees",
+        "error of the stick's length, from both positions": f"±{100 * limits.stick_error:.0f} cm",
         "battery": f"{limits.battery:g} V for {limits.battery_time:g} s",
-        "battery in hover": f"{lift.RESERVE:g} V above that at which full power just carries, at the end of a landing",
-        "thrust at its bound": f"{limits.saturation_time:g} s",
-        "missed deadlines in a second": f"{limits.missed_deadlines}",
-        "gap between two ticks": f"{1000 * limits.longest_gap:.0f} ms",
+        "battery in hover, predicted for the end of a landing": f"{lift.RESERVE:g} V above the voltage "
+        "at which full power just carries the pair",
+        "time with the thrust at its bound": f"{limits.saturation_time:g} s",
+        "missed deadlines of the loop in a second": f"{limits.missed_deadlines}",
+        "gap between two ticks of the loop": f"{1000 * limits.longest_gap:.0f} ms",
         "height above the goal, on a stand": f"{100 * STAND_SPARE:.0f} cm",
         "sent roll and pitch": f"±{math.degrees(controller.tilt_limit):.0f} degrees",
         "sent thrust": f"{THRUST_FLOOR} .. {THRUST_CEILING} units",
         "ramp to hover": f"{times.ramp:g} s, and at most {times.lift:g} s more until the pair is off the ground",
         "landing speed of the goal": f"{times.land_speed:g} m/s",
         "descent": f"{times.descend_speed:g} m/s for at most {times.descent_limit(0.4):.2g} s from 0.4 m",
-        "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
+        "longest *hold*, from the last packet of a drone": f"{times.drone_watchdog:g} s",
         "thrust in *hold* below hover": f"up to {100 * setpoints.UNEVEN / setpoints.GRAVITY:.0f} %, "
-        f"{100 * setpoints.GENTLE / setpoints.GRAVITY:.0f} % where neither drone is heard",
-        "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
+        f"{100 * setpoints.GENTLE / setpoints.GRAVITY:.0f} % if no drone's states arrive",
+        "time without a valid pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
     }
     return "\n".join(["| bound | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
 
 
 def parameters() -> str:
     """The parameters on which the twin acts, by group."""
-    lines = ["| group | on which the twin acts |", "|---|---|"]
+    lines = ["| group | parameters that the twin uses |", "|---|---|"]
     for group, names in itertools.groupby(sorted(ACTED), lambda name: name.partition(".")[0]):
         lines.append(f"| `{group}` | {', '.join(name.partition('.')[2] for name in names)} |")
     return "\n".join(lines)
@@ -128,7 +129,7 @@ TURNED = 90  # [degrees] of tilt, from which on the pair lies on its back
 def faults() -> str:
     """What `--fault` does, and what `benchmarks/fly_faults_virtual.py` found: the flight with the harder touchdown."""
     rows = json.loads(FAULTS.read_text(encoding="utf-8"))["faults"]
-    head = ("`--fault`", "what happens", "then", "motors off [s]", "touchdown", "tilt", "drift")
+    head = ("`--fault`", "what happens", "reaction", "motors off [s]", "touchdown", "largest tilt", "drift sideways")
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for name in dict.fromkeys([*FAULT_KINDS, *(row["fault"] for row in rows)]):
         about = f"`{name}` | {FAULT_KINDS[name].about}" if name in FAULT_KINDS else f"| {name}"
@@ -150,7 +151,10 @@ def positioning() -> str:
     """Hover of `flight` on each system, by `benchmarks/fly_faults_virtual.py --positioning`."""
     rows = json.loads(POSITIONING.read_text(encoding="utf-8"))["flights"]
     names = ("rms", "x", "y", "z")
-    lines = [f"| system | {' | '.join(names)} | largest tilt | noticed after |", "|---" * (len(names) + 3) + "|"]
+    lines = [
+        f"| system | {' | '.join(f'{name} [mm]' for name in names)} | largest tilt | lost pose noticed after |",
+        "|---" * (len(names) + 3) + "|",
+    ]
     for system in dict.fromkeys(row["positioning"] for row in rows):
         own = [row for row in rows if row["positioning"] == system]
         flown = [row for row in own if not row["fault"]]

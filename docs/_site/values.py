@@ -11,6 +11,7 @@ import json
 import math
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -126,6 +127,13 @@ def oracle_share(track: str) -> str:
             tried, kept = tried + sum(one is not None for one in candidates), kept + len(found)
         shares.append(f"{100 * kept / tried:.0f}")
     return "/".join(shares)
+
+
+def ranked(track: str, follower: str, conditions: Sequence[str] = CONDITIONS) -> str:
+    """calm/world: successes of `follower` on the leaderboard [%]."""
+    entries = importlib.import_module("docs.leaderboard").entries()
+    (own,) = (entry["tracks"][track] for entry in entries if entry["follower"] == follower)
+    return "/".join(f"{100 * own[one]['succeeded'] / own[one]['flights']:.0f}" for one in conditions)
 
 
 teams = [row for row in results("horizon")["rows"] if (row["policy"], row["seconds"]) == ("universal", 600)]

@@ -84,8 +84,8 @@ def summaries(group: Group, followers: Sequence[Follower]) -> list[dict[str, dic
     config, flights = group
     scenarios = [with_seed(one, KEY, 0) for one in flights]
     radii, deadlines = (np.array([getattr(one, name) for one in flights]) for name in ("radius", "deadline"))
-    repeated = (np.tile(values, len(followers)) for values in (radii, deadlines))
-    _, metrics = fly_and_measure(config, [(one, scenarios) for one in followers], ENGINE, *repeated)
+    radius, latest = (np.tile(values, len(followers)) for values in (radii, deadlines))
+    _, metrics = fly_and_measure(config, [(one, scenarios) for one in followers], ENGINE, radius, latest)
     found = []
     for begin in range(0, len(metrics), len(flights)):
         own = list(zip(metrics[begin : begin + len(flights)], flights, strict=True))

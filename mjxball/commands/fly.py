@@ -11,18 +11,28 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.baselines import BASELINES
-from mjxball.commands.followers import Named, add_flight, add_followers, add_policies, load, named, refuse_same_names
+from mjxball.commands.followers import (
+    Named,
+    add_flight,
+    add_followers,
+    add_policies,
+    flown,
+    load,
+    named,
+    refuse_same_names,
+)
 from mjxball.commands.scenarios import native_scenarios, scenarios_of, setup_of
 from mjxball.errors import InputError
 from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant
 from mjxball.evaluate.report import write_report
-from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
+from mjxball.evaluate.results import Result, table, to_json
 from mjxball.evaluate.scenarios import rig_summary, standard_scenarios
 from mjxball.files import write_atomically
 from mjxball.plotting import STYLES
 from mjxball.policy import Policy
 from mjxball.sim.scenario import Scenario
+from mjxball.terminal import Working
 from mjxball.train.run_directory import versions
 
 
@@ -116,7 +126,7 @@ def run(options: argparse.Namespace, command: str) -> int:
     written: list[Result] = []
     code = 0
     for number, (group, baselines, policies) in enumerate(loaded):
-        results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
+        results = flown(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")
         if options.plant or group.setup.plant != config.Plant():
@@ -126,8 +136,9 @@ def run(options: argparse.Namespace, command: str) -> int:
             written += results
         if options.out:
             place = options.out / group.setup.preset if number else options.out
-            write_results(results, place, options.style)
-            write_report(place, group.setup.plant, results, policies, command, versions())
+            with Working("drawing the figures and the report"):
+                write_results(results, place, options.style)
+                write_report(place, group.setup.plant, results, policies, command, versions())
             print(f"report.html, figures and cells.json are in {place}")
         if options.check:
             code = max(code, _check(group.setup, policies, results, options.physics))
@@ -160,7 +171,7 @@ def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[R
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:
-        known |= {result.follower: result for result in fly_scenarios(plain, missing, [reference], physics)}
+        known |= {result.follower: result for result in flown(plain, missing, [reference], physics)}
     failed = False
     for policy in policies:
         misses = check_bounds(policy, known[policy.name].metrics)

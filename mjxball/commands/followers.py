@@ -14,10 +14,12 @@ from mjxball.control.followers import Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.followers import FollowerFactory, follower_factory
 from mjxball.evaluate.policies import load_policy
+from mjxball.evaluate.results import Result, fly_scenarios
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.file import policy_path, shipped_policies
-from mjxball.terminal import Status, warn
+from mjxball.sim.scenario import Scenario
+from mjxball.terminal import Status, Working, warn
 
 
 def add_policies(parser: argparse.ArgumentParser) -> None:
@@ -108,3 +110,11 @@ def clock() -> Callable[[str], None]:
     """A function that prints the time since this call and a text on stderr, to show progress."""
     started, status = time.monotonic(), Status()
     return lambda text: status.say(f"{time.monotonic() - started:6.1f} s  {text}")
+
+
+def flown(setup: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str) -> list[Result]:
+    """`fly_scenarios`, which says on stderr how far it is."""
+    counts = (followers, "follower"), (scenarios, "scenario")
+    many, each = (f"{len(things)} {name}{'s' if len(things) > 1 else ''}" for things, name in counts)
+    with Working(f"flying {many} in {each}") as working:
+        return fly_scenarios(setup, followers, scenarios, physics, working)

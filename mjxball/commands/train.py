@@ -32,7 +32,7 @@ from mjxball.evaluate.results import RESULTS
 from mjxball.evaluate.scenarios import rig_summary
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
-from mjxball.terminal import say, warn
+from mjxball.terminal import Working, say, warn
 from mjxball.train import processes, shares
 from mjxball.train.curves import plot_training
 from mjxball.train.run_directory import CHECKPOINTS, POLICY
@@ -61,10 +61,9 @@ def parser() -> cli.Parser:
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
         describe=_describe,
     )
-    names = ", ".join(config.PRESETS)
-    preset = result.add_argument(
-        "preset", nargs="?", metavar="PRESET", help=f"one of {names} (default quick; with SAC or PPO transport)"
-    )
+    about = "\n\n".join(f"{name}: {text}" for name, text in config.PRESETS_ABOUT.items())
+    about = f"default quick; with SAC or PPO transport\n\n{about}"
+    preset = result.add_argument("preset", nargs="?", metavar="PRESET", help=about)
     vars(preset)["suggested"] = tuple(config.PRESETS)
     run = result.add_argument_group("the run")
     run.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
@@ -78,10 +77,7 @@ def parser() -> cli.Parser:
     run.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     about = "begin with the weights of a policy file or shipped policy, or each member with those of a run's"
     run.add_argument("--start-from", type=policy_path, metavar="POLICY", help=about)
-    by = [name for name in config.PRESETS if config.algorithm_of(name) == "gradient"]
-    about = (
-        f"one of {', '.join(ALGORITHMS)} (default: gradient for {', '.join(by)}, else sac), or MODULE:CLASS, your own"
-    )
+    about = f"one of {', '.join(ALGORITHMS)} (default the preset's), or MODULE:CLASS, your own"
     run.add_argument("--algorithm", metavar="NAME", help=about)
     about = "engine, mjx (default; SAC and PPO) or newton-euler, which is quicker (gradients: always)"
     run.add_argument("--physics", choices=TRAINING_ENGINES, metavar="ENGINE", help=about)
@@ -216,6 +212,7 @@ def _finish(
         return code
     print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)
     if code:
+        say(f"stopped, with exit code {code}; python train.py --resume {out} continues")
         return code
     plot_training(out, settings, out / "eval" / "training.png")
     if not is_evaluated(origin):
@@ -226,7 +223,8 @@ def _finish(
     for watched in watches:
         from mjxball.commands.watch import write
 
-        watched.end()
+        with Working("flying the follower in flights of the benchmark"):
+            watched.end()
         if watched.points:
             print(write(watched, out / "eval"))
     return code

@@ -9,7 +9,7 @@ from mjxball.config._model_source import MAX_ELEMENTS, MAX_PIXELS
 from mjxball.config._plant import Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, follow_plant, read_plant, with_plant
 from mjxball.config._plausible import check_lift, thrust_over_weight, total_mass
-from mjxball.config._presets import PRESETS, algorithm_of, preset
+from mjxball.config._presets import PRESETS, PRESETS_ABOUT, algorithm_of, preset
 from mjxball.config._scenario import Motion, Rigs, ScenarioRanges
 from mjxball.config._settings import Attitude, Autopilot, Bounds, Command, Config, Follower, Leader, Reward, Timing
 from mjxball.config._tree import (
@@ -35,6 +35,7 @@ __all__ = [
     "PLANTS",
     "PLANT_PARTS",
     "PRESETS",
+    "PRESETS_ABOUT",
     "THRUST_MARGIN",
     "Attitude",
     "Autopilot",

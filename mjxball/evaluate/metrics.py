@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,9 +114,10 @@ def fly_and_measure(
     physics: str = "mjx",
     radius: Array | float = math.nan,
     deadline: Array | float = math.nan,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Trajectory, list[Metrics]]:
     """Every flight of `simulate_batch`, with its metrics; `radius` and `deadline` as in `begin`."""
-    flown, scenarios = simulate_batch(config, flights, physics), [one for _, part in flights for one in part]
+    flown, scenarios = simulate_batch(config, flights, physics, progress), [one for _, part in flights for one in part]
     limit, most = config.scenario.termination_distance, rotor_limits(config.plant, scenarios)
     return flown, measure_batch(flown, limit, most, config.plant.leader, radius, deadline)
 

@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,11 +59,19 @@ class Result:
 
 
 def fly_scenarios(
-    config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str
+    config: Config,
+    followers: Sequence[Follower],
+    scenarios: Sequence[Scenario],
+    physics: str,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[Result]:
-    """Fly every follower through every scenario; results are ordered by scenario, then by follower."""
+    """Fly every follower through every scenario; results are ordered by scenario, then by follower.
+
+    `progress` is called with the share that is flown.
+    """
     scenarios = [of_plant(config, scenario) for scenario in scenarios]
-    flights, measured = fly_and_measure(config, [(follower, scenarios) for follower in followers], physics)
+    flights_of = [(follower, scenarios) for follower in followers]
+    flights, measured = fly_and_measure(config, flights_of, physics, progress=progress)
     results = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
         index = j * len(scenarios) + i

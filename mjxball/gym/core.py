@@ -244,9 +244,12 @@ def _batch_of_one(leaves: Any) -> Any:
 
 
 def settings(preset: str, config: Config | None) -> Config:
-    """`config`, validated, or else the preset called `preset`, without a GRU: trainers have their own networks."""
+    """`config`, validated, or else the preset called `preset`, without what our own networks are.
+
+    Trainers have their own, without our GRU, which see positions too.
+    """
     valid = configs.preset(preset) if config is None else configs.validate(config)
-    return configs.replace(valid, "follower.recurrent_units", 0)
+    return configs.replace(configs.replace(valid, "follower.recurrent_units", 0), "follower.ignore_position", False)
 
 
 def pair_settings(preset: str, config: Config | None) -> Config:

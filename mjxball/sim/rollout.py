@@ -154,10 +154,13 @@ def check_rate(config: Config, follower: Follower) -> None:
         raise InputError(f"{follower.name} was made for a control period of {wanted:g} s, not {period:g} s")
 
 
-def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Trajectory:
+def simulate_batch(
+    config: Config, flights: Flights, physics: str = "mjx", progress: Callable[[float], None] = lambda share: None
+) -> Trajectory:
     """Fly every (follower, scenarios) pair at once; the batch axis runs over all scenarios in order.
 
-    All scenarios must last equally long. Each follower is called once per control step for its own part.
+    All scenarios must last equally long. Each follower is called once per control step for its own part. `progress` is
+    called with the share that is flown.
     """
     validate(config)
     controller = Together(flights)
@@ -169,6 +172,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     state, observation = loop.start(flown.start, inputs.at(0).goal, load, flown.first, flown.settings)
     carry, plants, rows = Carry(state, observation, controller.start(observation)), [], []
     for number in range(len(inputs.time)):
+        progress(number / len(inputs.time))
         plants.append(carry.loop.plant)
         carry, row = control_step(loop, controller, privileged, load, carry, inputs.at(number), on_pid)
         rows.append(row)

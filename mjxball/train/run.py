@@ -67,7 +67,7 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if not stop.begun and jax.process_count() == 1:
             progress.end_status()
-            progress.say("stopped before training began; --resume begins it")
+            progress.say("stopped before training began, with exit code 130; --resume begins it")
             lock.drop()
             os._exit(130)  # XLA's compilation cannot be interrupted
         progress.end_status()  # now, because a second Ctrl-C exits at once

@@ -28,6 +28,7 @@ from mjxball.reading import check_times, parse_json
 from mjxball.terminal import warn
 
 if TYPE_CHECKING:
+    from mjxball.sim.scenario import Scenario
     from mjxball.sim.trajectory import Trajectory
 
 FORMAT = "mjxball flight 1"
@@ -76,6 +77,7 @@ class Flight:
     plant: Plant
     arrays: dict[str, np.ndarray]
     marks: tuple[Mark, ...] = ()  # of a flight on hardware or the twin
+    facts: tuple[tuple[str, str], ...] = ()  # names and values of what was measured of a simulated flight
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.arrays[name]
@@ -216,7 +218,21 @@ def _simulated(source: str, changes: Mapping[str, Any], physics: str, plant: Pat
     if setup.motion.kind == "rolling":
         motion = f"ball from {100 * scenario.ball_start:g} cm"
     states = _hidden_states(follower, trajectory.observation) if hidden else None
-    return flight_of(trajectory, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg", states)
+    flight = flight_of(trajectory, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg", states)
+    return dataclasses.replace(flight, facts=_facts(setup, trajectory, scenario))
+
+
+def _facts(setup: configs.Config, trajectory: Trajectory, scenario: Scenario) -> tuple[tuple[str, str], ...]:
+    """What was measured of a simulated flight, as the viewer shows it."""
+    from mjxball.evaluate.metrics import measure_batch, rotor_limits
+
+    limits, leader = rotor_limits(setup.plant, [scenario]), setup.plant.leader
+    (found,) = measure_batch(trajectory.batched(), setup.scenario.termination_distance, limits, leader)
+    if found.failed:
+        return (("flight", "failed"),)
+    settled = "never" if found.settling_time is None else f"{found.settling_time:.2f} s"
+    late = () if np.isnan(found.peak) else (("largest error from 20 s on", f"{1e3 * found.peak:.1f} mm"),)
+    return (("settles", settled), *late, ("rotor at its limit", f"{100 * (found.rotors_at_limit or 0):.1f} %"))
 
 
 def _hidden_states(follower: Any, observations: np.ndarray) -> np.ndarray | None:

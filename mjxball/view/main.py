@@ -13,6 +13,7 @@ from mjxball.cli import Parser, make_parser, output_file
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
 from mjxball.running import run_command
+from mjxball.terminal import Working
 from mjxball.view.flight import Flight, flight_from, save_flight
 from mjxball.view.page import flight_page
 
@@ -75,12 +76,17 @@ def show(options: argparse.Namespace, flight_from: Callable[..., Flight]) -> int
         raise InputError("--speed is of --video; a page has its own")
     _check(options)
     given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
-    flights = [flight_from(one, given, options.physics, options.plant, options.hidden) for one in options.source]
+    flights = []
+    for one in options.source:
+        with Working(f"preparing the flight of {Path(one).name}"):
+            flights.append(flight_from(one, given, options.physics, options.plant, options.hidden))
     if len({flight.title for flight in flights}) < len(flights):  # equal titles would be ambiguous
         named = zip(options.source, flights, strict=True)
         flights = [dataclasses.replace(one, title=f"{Path(source).name}: {one.title}"[:200]) for source, one in named]
     if options.video:
-        write_atomically(options.video, _video(flights, options.video.suffix, options.speed or 1.0))
+        with Working("drawing the video"):
+            film = _video(flights, options.video.suffix, options.speed or 1.0)
+        write_atomically(options.video, film)
         print(f"the video is {options.video}")  # noqa: T201
     if options.save:
         save_flight(options.save, flights[0])

@@ -59,6 +59,7 @@ def page_contents(flight: Flight) -> dict[str, Any]:
         "arrays": {name: packed(array) for name, array in (shown | {"thrust": flight["rotor_force"].sum(-1)}).items()},
         "plant": plant_of(flight.plant),
         "marks": [mark._asdict() for mark in flight.marks],
+        "facts": flight.facts,
     }
 
 

@@ -235,5 +235,5 @@ interface, `policy.h` and `rig.h` the policy.
 and likewise in `follower/`. Both drones must be on the same radio channel and data rate, or they do not hear each
 other. Then `python -m mjxfly POLICY.npz --onboard --leader URI --follower URI`.
 
-No such app has been on hardware. Propellers off first: see docs/onboard.md of mjxball.
+No such app has been on hardware. Propellers off first: see docs/hardware.md of mjxball.
 """

@@ -1,6 +1,6 @@
 """Make apps for the firmware of two Crazyflies, `python -m mjxfly.app POLICY|RUN DIR`.
 
-DIR is a new directory with an app for each drone; see docs/onboard.md.
+DIR is a new directory with an app for each drone; see docs/hardware.md.
 """
 
 from __future__ import annotations

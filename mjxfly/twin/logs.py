@@ -20,7 +20,7 @@ from mjxfly.twin.estimators import euler_of
 from mjxfly.twin.pair import Report
 
 GRAVITY = 9.81  # [m/s2]
-# Type number and struct code of each type of log variables (docs/crazyflie.md).
+# Type number and struct code of each type of log variables (docs/hardware.md).
 LOG_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h")}
 LOG_TYPES |= {"int32_t": (6, "i"), "float": (7, "f"), "FP16": (8, "e")}
 LOG_CODES = dict(LOG_TYPES.values())

@@ -69,7 +69,7 @@ def test_motors_that_work_apart_lift_besides() -> None:
 
 def test_thrust_per_acceleration() -> None:
     assert thrust_slopes(FLIGHT) == pytest.approx((0.03775, 0.03775))
-    assert sum(thrust_slopes(STAND)) / 0.0755 == pytest.approx(0.32, abs=0.005)  # docs/crazyflie.md
+    assert sum(thrust_slopes(STAND)) / 0.0755 == pytest.approx(0.32, abs=0.005)  # docs/hardware.md
 
 
 def test_ball_on_the_stand_turns_with_five_sevenths_of_gravity() -> None:

@@ -43,6 +43,9 @@ def flags(text: str) -> set[str]:
 def test_help_fits_three_screens_and_all_has_everything(helped: Helped) -> None:
     common, every = helped("train", "--help"), helped("train", "--help", "all")
     assert len(common.splitlines()) <= 120
+    assert list(config.PRESETS_ABOUT) == list(config.PRESETS)
+    for name, about in config.PRESETS_ABOUT.items():
+        assert f" {name}: {about}\n" in common
     assert {f"--{path}" for path in COMMON} | {"--seed", "--out", "--resume", "--plant"} <= flags(common)
     assert flags(common) < flags(every)
     assert {f"--{path}" for path, _, _ in config.leaves(config.Config())} <= flags(every)

@@ -1,4 +1,4 @@
-"""The Crazyflie's own control against its facts: docs/crazyflie.md has the sources."""
+"""The Crazyflie's own control against its facts: docs/hardware.md has the sources."""
 
 from __future__ import annotations
 

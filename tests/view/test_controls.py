@@ -182,7 +182,7 @@ def test_keys_are_listed(tab: Any) -> None:
 
 def test_the_y_range_is_of_what_is_seen_until_it_is_pinned(tab: Any, flight: Flight) -> None:
     def ranges() -> list[float]:
-        return tab.evaluate("(() => { const plot = player.panes[0].plots[2]; return [plot.low, plot.high]; })()")
+        return tab.evaluate("(() => { const plot = player.panes[0].plots[3]; return [plot.low, plot.high]; })()")
 
     def expected(begin: float, end: float) -> list[float]:
         rows = (flight["time"] >= begin - 1e-6) & (flight["time"] <= end + 1e-6)
@@ -190,13 +190,13 @@ def test_the_y_range_is_of_what_is_seen_until_it_is_pinned(tab: Any, flight: Fli
         margin = 0.06 * (seen.max() - seen.min())
         return [seen.min() - margin, seen.max() + margin]
 
-    assert tab.locator(".plot h3").nth(2).inner_text().startswith("Attitude")
+    assert tab.locator(".plot h3").nth(3).inner_text().startswith("Attitude")
     np.testing.assert_allclose(ranges(), expected(0, SECONDS), rtol=1e-5)
     tab.select_option("#width", "1")
     tab.evaluate("player.seek(0.7)")
     early = expected(0.2, 1.2)
     np.testing.assert_allclose(ranges(), early, rtol=1e-5)
-    pin = tab.locator(".plot").nth(2).locator(".pin")
+    pin = tab.locator(".plot").nth(3).locator(".pin")
     pin.click()
     tab.evaluate("player.seek(3)")
     np.testing.assert_allclose(ranges(), early, rtol=1e-5)
@@ -334,7 +334,7 @@ def test_half_an_hour_is_stored_whole_and_drawn_thin(browser: Any, flight: Fligh
     arrays["euler"][peak, 2] = 0.9
     tab = opened(browser, written(tmp_path, dataclasses.replace(flight, arrays=arrays)), 1300)
     path, stored, points, highest = tab.evaluate(
-        """() => { const [{ flight, plots }] = player.panes, plot = plots[2], found = [];
+        """() => { const [{ flight, plots }] = player.panes, plot = plots[3], found = [];
             const context = { beginPath() {}, stroke() {}, lineTo: (x, y) => found.push([x, y]) };
             plot.trace(context, plot.series[2].value, (time) => 400 * time / flight.last, (v) => v, 1);
             return [flight.trail().length, flight.rows, found.length, Math.max(...found.map(([, v]) => v))];

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, call, listing
+from command_line import assert_one_line, call, listing, without_progress
 
 from mjxball.errors import InputError
 from mjxball.evaluate.render import render
@@ -31,7 +31,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def made(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     code = call(main, arguments)
-    errors = capsys.readouterr().err
+    errors = without_progress(capsys.readouterr().err)
     if "no working GL library" in errors:
         pytest.skip(errors)
     assert (code, errors) == (0, "")

@@ -206,7 +206,8 @@ def test_it_shows_the_numbers_of_the_moment(tab: Any, flight: Flight):
     ]
     np.testing.assert_allclose(shown, error, rtol=6e-3)  # three digits
     titles = [re.sub(r" \[.*", "", text) for text in tab.locator(".plot h3").all_inner_texts()]
-    assert titles[0] == "Error to the goal"
+    assert titles[:2] == ["Error to the goal", "Error near the goal, up to ±20 mm"]
+    assert tab.locator(".who span").all_inner_texts() == [" leader", " follower"]
     assert {"Thrust", "Contact force on the object", "CG from the centre"} <= set(titles)
 
 

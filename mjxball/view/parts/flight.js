@@ -1,7 +1,7 @@
 // One flight: flat arrays of `rows` rows, and values derived from them.
 class Flight {
-  constructor({ title, rows, arrays, plant, marks = [] }) {
-    Object.assign(this, { title, rows, plant, marks, arrays: {}, kept: [0], seen: 1, step: 0.005 });
+  constructor({ title, rows, arrays, plant, marks = [], facts = [] }) {
+    Object.assign(this, { title, rows, plant, marks, facts, arrays: {}, kept: [0], seen: 1, step: 0.005 });
     for (const [name, text] of Object.entries(arrays)) this.arrays[name] = Flight.unpacked(text);
     this.time = this.arrays.time;
   }

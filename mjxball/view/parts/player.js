@@ -4,6 +4,8 @@
 const NEEDED = { thrust: 'thrust', contact: 'contact_force', weight: 'object_mass', path: 'position' };
 const DEGREES = 180 / Math.PI;
 
+const FINE = 20;  // largest error of the plot near the goal [mm]
+
 // Plots of a flight, for the arrays that it has.
 function recipes(flight) {
   const line = (name, its, value, dash) => ({ name, colour: its, value, dash });
@@ -20,6 +22,8 @@ function recipes(flight) {
   };
   plot('target', 'Error to the goal', 'm', () => ['x', 'y', 'z'].map((name, k) =>
     line(name, name, (row) => flight.error(row, k))));
+  plot('target', `Error near the goal, up to ±${FINE} mm`, 'mm', () => ['x', 'y', 'z'].map((name, k) =>
+    line(name, name, (row) => clamp(1000 * flight.error(row, k), -FINE, FINE))));
   plot('cg_offset', 'CG from the centre', 'cm', () => along.map((axis, k) => {
     const [name, its] = along.length === 1 ? ['offset', 'cg'] : ['xy'[axis], 'xy'[axis]];
     return line(name, its, (row) => 100 * flight.get('cg_offset', row, k));
@@ -47,6 +51,16 @@ class Pane {
     const view = document.getElementById('view').content.cloneNode(true).firstElementChild;
     document.getElementById('views').append(view);
     view.querySelector('h2').textContent = flight.title;
+    view.querySelector('.who').replaceChildren(...flight.plant.drones.map(({ name }, drone) => {
+      const label = element('span');
+      label.append(swatch(flight.colour(drone)), ` ${name}`);
+      return label;
+    }));
+    view.querySelector('.facts').replaceChildren(...flight.facts.map(([name, value]) => {
+      const fact = element('div');
+      fact.append(element('dt', name), element('dd', value));
+      return fact;
+    }));
     this.tell = (name, text) => { view.querySelector(`.now-${name}`).textContent = text; };
     view.querySelector('.now-cg').parentElement.hidden = !flight.has('cg_offset');
     this.phase = view.querySelector('.now-phase').parentElement;
