@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The block of README.md between `<!-- docs/readme.py -->` and `<!-- end -->`, made of the leaderboard's entries.
 
-`python docs/readme.py` rewrites it. A follower without an entry has no row.
+`python docs/readme.py` rewrites it.
 """
 
 from __future__ import annotations
@@ -10,94 +10,66 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from leaderboard import KINDS, best, entries
+from leaderboard import KINDS, best
 from mjxball.bench import CONDITIONS
-from mjxball.bench.entry import HEADS, cells
-from mjxball.bench.tracks import TRACKS as BENCH_TRACKS
 from mjxball.running import run_command
 
 REPOSITORY = Path(__file__).parents[1]
 README = REPOSITORY / "README.md"
 BLOCK = re.compile(r"(?<=<!-- docs/readme.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
-TRACKS = {"pair": "mass known", "pair-unknown": "mass unknown"}
-CLASSICAL = {
-    "copy": "`copy`: the PD controller alone",
-    "adaptive": "`adaptive`",
-    "pid": "`pid`",
-    "observer": "`observer`",
-    "mpc": "`mpc`",
-    "lqg": "`lqg`",
+ROWS = {
+    "pair": "a pair",
+    "team": "a team of 3 to 6",
+    "rigs": "a random rig of 2 to 6",
+    "crazyflie": "two Crazyflies",
 }
-TRAINED = {"sac": "**`sac`**: learned by SAC", "balance": "**`balance`**: learned by gradients"}
 RESULTS = REPOSITORY / "benchmarks" / "results"
 FIRST = {  # what README trains
     RESULTS / "first_command.json": (
-        "The training below succeeds in {shares} % after {seconds} s on two cores, medians of {seeds} seeds;"
+        "The first command trains a follower for a pair with {shares} % (calm/disturbed) in {seconds} s on two cores,"
     ),
-    RESULTS / "first_command_sac.json": (
-        "`--algorithm sac`, the paper's algorithm on MJX, succeeds in {shares} % after {seconds} s."
-    ),
+    RESULTS
+    / "first_command_sac.json": "the paper's way, `--algorithm sac` on MJX, one with {shares} % in {seconds} s.",
 }
-COLUMNS = (
-    "follower",
-    "success [%]",
-    "mass unknown [%]",
-    "late error, 90 % [mm]",
-    "rotor at its limit [%]",
-    "power over hover",
-    "change of commands [mrad]",
-)
-
-Tracks = dict[str, dict[str, Any]]  # an entry's results of each track and condition
 
 
-def shown(tracks: Tracks, track: str, head: str) -> str:
-    """calm/world of one column of the leaderboard; a dash if the track was not flown."""
-    if track not in tracks:
-        return "-"
-    return "/".join(dict(zip(HEADS, cells(tracks[track][one]), strict=True))[head] for one in CONDITIONS)
+def row(track: str, text: str) -> str:
+    """One line of the table: the best of each kind with disturbances; the better one is bold."""
+    found = {kind: best(names, track, CONDITIONS[-1]) for kind, names in KINDS.items()}
+    most = max(share for share, _ in found.values())
+    shown = [text]
+    for kind in ("classical", "learned"):
+        share, entries = found[kind]
+        who = ", ".join(f"`{entry['follower']}`" for entry in entries)
+        cell = f"{who} {share:.0f}" if entries else "-"
+        shown.append(f"**{cell}**" if share == most and entries else cell)
+    return " | ".join(shown)
 
 
-def row(text: str, tracks: Tracks) -> str:
-    """One line of the table."""
-    columns = (("pair", "success %"), ("pair-unknown", "success %"))
-    columns += (("pair", "late mm"), ("pair", "limit %"))
-    columns += (("pair", "power"), ("pair", "change mrad"))
-    return " | ".join([text, *(shown(tracks, *column) for column in columns)])
-
-
-def leads() -> list[str]:
-    """In how many of the cells of the chart, `best.svg`, a classical follower is better."""
-    both = [[best(names, track, one)[0] for names in KINDS.values()] for track in BENCH_TRACKS for one in CONDITIONS]
-    flown = [shares for shares in both if min(shares) >= 0]
-    ahead = sum(classical > learned for learned, classical in flown)
-    return [f"Classical followers lead in {ahead} of {len(flown)} cells."] if flown else []
+def leads() -> str:
+    """In how many of the tasks a classical follower is better without disturbances."""
+    both = [[best(KINDS[kind], track, CONDITIONS[0])[0] for kind in ("classical", "learned")] for track in ROWS]
+    ahead = sum(classical > learned for classical, learned in both)
+    return f"In calm flights a classical follower leads in {ahead} of these {len(both)} tasks."
 
 
 def sentences() -> list[str]:
-    """The size of `balance`, and what the first training is worth."""
-    with np.load(REPOSITORY / "policies" / "balance.npz") as policy:
-        parameters = sum(policy[key].size for key in policy if key.startswith(("weight", "bias", "gru")))
-    said = [f"`balance` has {parameters:,} weights.".replace(",", " ", 1)]
+    """What the first training is worth."""
+    said = []
     for path, text in FIRST.items():
         if path.exists():
             record = json.loads(path.read_text())
             shares = "/".join(f"{100 * record['median'][one]:.0f}" for one in CONDITIONS)
-            seconds, seeds = record["median"]["policy"], len({one["seed"] for one in record["rows"]})
-            said.append(text.format(shares=shares, seconds=f"{seconds:.0f}", seeds=seeds))
+            seconds = record["median"]["policy"]
+            said.append(text.format(shares=shares, seconds=f"{seconds:.0f}"))
     return said
 
 
 def block() -> str:
     """The text of the block."""
-    found = {entry["follower"]: entry["tracks"] for entry in entries()}
-    rows = [row(text, found[name]) for name, text in (CLASSICAL | TRAINED).items() if name in found]
-    table = [" | ".join(COLUMNS), "|".join(["---"] * len(COLUMNS)), *rows]
-    return "\n".join(["", *table, "", *leads(), *sentences(), "", ""])
+    table = ["task | best classical | best learned", "---|---|---", *(row(*one) for one in ROWS.items())]
+    return "\n".join(["", *table, "", leads(), *sentences(), "", ""])
 
 
 def main() -> int:

@@ -2,9 +2,9 @@
 
     python docs/readme_picture.py [OUT.gif]
 
-The last two cycles of a flight of 45 s in which the CG moves +-10 cm at 0.62 rad/s. They are steady state, so the
-picture loops. Above each flight with the path of O, below the distance of O from the goal on a logarithmic axis.
-Needs Pillow and a GL library of MuJoCo (MUJOCO_GL=egl on a machine without a display).
+Of the disturbed flights that a training watches (`mjxball.bench.quick`) the one in which the largest error of
+`lqg` after the deadline is its median. Above each flight with the path of O, below the distance of O from the
+goal on a logarithmic axis. Needs Pillow and a GL library of MuJoCo (MUJOCO_GL=egl on a machine without a display).
 """
 
 from __future__ import annotations
@@ -19,20 +19,26 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from mjxball import Scenario, simulate
 from mjxball.baselines import make_baseline
-from mjxball.config import Plant, preset
+from mjxball.bench.draw import quick_group
+from mjxball.bench.evaluation import with_seed
+from mjxball.bench.flying import ENGINE
+from mjxball.bench.quick import KEY
+from mjxball.config import Config, Plant
+from mjxball.control.rotations import matrix_from_quaternion
+from mjxball.evaluate.policies import load_policy
 from mjxball.plotting import LOOKS
-from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxball.scene import Scene
+from mjxball.sim.rollout import simulate_batch
 
-OMEGA, AMPLITUDE, GOAL = 0.62, 0.10, (1.0, 1.0, 1.0)  # [rad/s], [m], [m]
-END, SHOWN, SPEED = 45.0, 4 * math.pi / OMEGA, 2  # [s], [s], flight time over playing time
-FRAMES = 100  # two cycles, in each the same views
+SHOWN, SPEED = 20.0, 2  # [s], flight time over playing time
+FRAMES, TRAIL = 100, 10  # in all; of the path of O that is drawn
+LABELLED = {"leader": (26, 0, "lm"), "follower": (-26, 0, "rm"), "CG": (0, 34, "mm")}  # offsets [pixels], anchors
 DISTANCE, VIEW, FOVY = 1.78, (112.0, -24.0), math.radians(45)  # [m]; azimuth, elevation of Scene [degrees]; vertical
 PANE, HEAD, STRIP = (300, 236), 62, 166  # width and height of a view, heights of the names and of the curves [pixels]
 LEFT, RIGHT, TOP, BOTTOM = 84, 14, 16, 34  # of the curves within the strip [pixels]
-LOW, HIGH = 1e-5, 1.0  # ends of the error axis [m]
-TICKS = {1e-4: "0.1 mm", 1e-3: "1 mm", 1e-2: "1 cm", 1e-1: "10 cm", 1.0: "1 m"}
+LOW, HIGH = 1e-3, 3.0  # ends of the error axis [m]
+TICKS = {1e-3: "1 mm", 1e-2: "1 cm", 1e-1: "10 cm", 1.0: "1 m"}
 INK, PALE, PAPER = (29, 35, 41), (214, 219, 224), (255, 255, 255)
 COLOURS = 128  # of the GIF
 SMALL, MIDDLE, LARGE = (ImageFont.load_default(size) for size in (20, 26, 28))
@@ -53,21 +59,20 @@ class Follower(NamedTuple):
 def main() -> None:
     """Fly the followers, draw the frames, write the GIF."""
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "balance.gif"
-    config = preset("transport")
-    scenario = Scenario(omega=OMEGA, amplitude=AMPLITUDE, goal=GOAL, seconds=END)
+    config, scenario, radius = median_flight()
     followers = []
     for name, text, controller in (
         ("copy", "PD controller alone", make_baseline("copy", config)),
         ("lqg", "classical controller", make_baseline("lqg", config)),
-        ("balance", "trained network", Policy.load(shipped_policy("balance"))),
+        ("balance", "trained network", load_policy(shipped_policy("balance"), config)),
     ):
         colour = ImageColor.getrgb(LOOKS[name][0])
-        flight = simulate(config, controller, scenario, "newton-euler")
-        rows = np.searchsorted(flight.time, END + SHOWN * (np.arange(FRAMES) / FRAMES - 1))
+        flight = simulate(config, controller, scenario, ENGINE)
+        rows = np.searchsorted(flight.time, SHOWN * np.arange(FRAMES) / FRAMES)
         error = np.linalg.norm(flight.target - flight.position, axis=-1)
         parts = (part[rows] for part in (flight.position, flight.quaternion, flight.cg_offset, error))
         followers.append(Follower(name, text, colour, *parts))
-    pictures = draw(config.plant, followers)
+    pictures = draw(config.plant, followers, np.array(scenario.goal), radius)
     palette = Image.fromarray(np.concatenate([np.asarray(picture) for picture in pictures[::10]])).quantize(
         COLOURS, dither=Image.Dither.NONE
     )
@@ -77,14 +82,26 @@ def main() -> None:
     print(f"{out}: {out.stat().st_size / 1e6:.2f} MB")  # noqa: T201
 
 
-def draw(plant: Plant, followers: list[Follower]) -> list[Image.Image]:
+def median_flight() -> tuple[Config, Scenario, float]:
+    """(configuration, scenario, radius of success [m]) of the flight that is shown."""
+    config, flights = quick_group("pair")
+    disturbed = [one for one in flights if one.condition == "world"]
+    scenarios = [with_seed(one, KEY, 0) for one in disturbed]
+    flown = simulate_batch(config, [(make_baseline("lqg", config), scenarios)], ENGINE)
+    error = np.linalg.norm(flown.target - flown.position, axis=-1)
+    late = [error[flown.time > one.deadline, k].max() for k, one in enumerate(disturbed)]
+    chosen = int(np.argsort(late)[len(late) // 2])
+    return config, scenarios[chosen], disturbed[chosen].radius
+
+
+def draw(plant: Plant, followers: list[Follower], goal: np.ndarray, radius: float) -> list[Image.Image]:
     """The frames: the flights side by side above their errors, where a cursor is at the time of the frame."""
-    scene = Scene(plant, np.array(GOAL), (2 * PANE[1], 2 * PANE[0]), np.array(GOAL), DISTANCE)
-    below, pictures = curves(followers), []
+    scene = Scene(plant, goal, (2 * PANE[1], 2 * PANE[0]), goal, DISTANCE)
+    below, pictures = curves(followers, radius), []
     for row in range(FRAMES):
         picture = Image.new("RGB", (below.width, HEAD + PANE[1] + STRIP), PAPER)
         for k, follower in enumerate(followers):
-            picture.paste(pane(scene, follower, row), (k * (PANE[0] + 3), 0))
+            picture.paste(pane(scene, follower, row, plant, goal), (k * (PANE[0] + 3), 0))
         picture.paste(below, (0, HEAD + PANE[1]))
         brush = ImageDraw.Draw(picture)
         x, bottom = across(row, picture.width), picture.height
@@ -96,20 +113,26 @@ def draw(plant: Plant, followers: list[Follower]) -> list[Image.Image]:
     return pictures
 
 
-def pane(scene: Scene, follower: Follower, row: int) -> Image.Image:
-    """One flight under its name, with the path of O during the last cycle and the goal."""
+def pane(scene: Scene, follower: Follower, row: int, plant: Plant, goal: np.ndarray) -> Image.Image:
+    """One flight under its name, with the latest path of O and the goal."""
     image = Image.new("RGB", (PANE[0], HEAD + PANE[1]), PAPER)
     view = scene.picture(follower.position[row], follower.quaternion[row], follower.offset[row])
     image.paste(Image.fromarray(view).resize(PANE, Image.Resampling.BOX), (0, HEAD))
     brush, colour, centre = ImageDraw.Draw(image), follower.colour, PANE[0] / 2
-    path = [pixel(point) for point in follower.position[np.arange(row - FRAMES // 2, row + 1)]]
+    path = [pixel(point - goal) for point in follower.position[max(row - TRAIL, 0) : row + 1]]
     brush.line(path, fill=colour, width=4, joint="curve")
-    x, y = pixel(np.array(GOAL))
+    x, y = pixel(np.zeros(3))
     brush.line([(x, y - 66), (x, y - 20)], fill=INK, width=2)
     brush.line([(x, y + 20), (x, y + 66)], fill=INK, width=2)
     brush.ellipse([x - 20, y - 20, x + 20, y + 20], outline=INK, width=2)
     brush.text((x, y - 72), "goal", fill=INK, font=SMALL, anchor="ms")
     dot(brush, path[-1], 7, colour, PAPER)
+    turn = matrix_from_quaternion(follower.quaternion[row])
+    offset = np.append(follower.offset[row], [0.0, 0.0]) if plant.cg_axis == "x" else np.zeros(3)
+    places = {"leader": plant.drones[0].mount, "follower": plant.drones[1].mount, "CG": offset}
+    for text, (right, down, anchor) in LABELLED.items():
+        x, y = pixel(follower.position[row] + turn @ np.array(places[text]) - goal)
+        brush.text((x + right, y + down), text, fill=INK, font=SMALL, anchor=anchor, stroke_width=2, stroke_fill=PAPER)
     brush.rectangle([0, 0, PANE[0], HEAD - 1], fill=colour)
     brush.text((centre, 20), follower.name, fill=PAPER, font=LARGE, anchor="mm", stroke_width=0.5)
     brush.text((centre, 46), follower.text, fill=PAPER, font=SMALL, anchor="mm")
@@ -119,15 +142,18 @@ def pane(scene: Scene, follower: Follower, row: int) -> Image.Image:
     return image
 
 
-def curves(followers: list[Follower]) -> Image.Image:
-    """The errors against time."""
+def curves(followers: list[Follower], radius: float) -> Image.Image:
+    """The errors against time, and the `radius` of success."""
     strip = Image.new("RGB", (len(followers) * (PANE[0] + 3) - 3, STRIP), PAPER)
-    brush, begin = ImageDraw.Draw(strip), END - SHOWN
+    brush = ImageDraw.Draw(strip)
     for value, text in TICKS.items():
         brush.line([(LEFT, height(value)), (strip.width - RIGHT, height(value))], fill=PALE, width=2)
         brush.text((LEFT - 8, height(value)), text, fill=INK, font=SMALL, anchor="rm")
-    for second in range(25, 45, 5):
-        x = across(FRAMES * (second - begin) / SHOWN, strip.width)
+    for x in range(LEFT, strip.width - RIGHT, 12):
+        brush.line([(x, height(radius)), (x + 6, height(radius))], fill=INK, width=2)
+    brush.text((LEFT + 6, height(radius) - 4), "allowed", fill=INK, font=SMALL, anchor="ls")
+    for second in range(5, round(SHOWN), 5):
+        x = across(FRAMES * second / SHOWN, strip.width)
         brush.text((x, STRIP - 8), f"{second} s", fill=INK, font=SMALL, anchor="ms")
     brush.text((strip.width - RIGHT, STRIP - 8), f"{SPEED}x speed", fill=INK, font=SMALL, anchor="rs")
     for follower in followers:
@@ -142,13 +168,12 @@ def dot(brush: ImageDraw.ImageDraw, at: tuple[float, float], radius: float, fill
     brush.ellipse(box, fill=fill, outline=outline, width=2)
 
 
-def pixel(point: np.ndarray) -> tuple[float, float]:
-    """Place of `point` (3,) [m] in a pane [pixels], as the scene's camera sees it."""
+def pixel(away: np.ndarray) -> tuple[float, float]:
+    """Place of what is `away` from the goal (3,) [m] in a pane [pixels], as the scene's camera sees it."""
     azimuth, elevation = map(math.radians, VIEW)
     right = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     level = math.cos(elevation)
     ahead = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
-    away = point - np.array(GOAL)
     scale = PANE[1] / 2 / math.tan(FOVY / 2) / (DISTANCE + away @ ahead)
     return PANE[0] / 2 + scale * (away @ right), HEAD + PANE[1] / 2 - scale * (away @ np.cross(right, ahead))
 

@@ -25,7 +25,6 @@ pytestmark = pytest.mark.slow
 PAGES = sorted([REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
 NOTEBOOK = DOCS / "notebooks" / "first_follower.ipynb"
 RUN = [
-    "README.md",
     "docs/tutorial.md",
     "docs/view.md",
     *(f"docs/howto/own-{n}.md" for n in ("rig", "model", "reward", "baseline", "environment", "algorithm")),

@@ -52,7 +52,7 @@ MODULES = (  # known by their last name
         "mjxball.physics.engine",
         "mjxball.sim.sensors",
     ),
-    *("mjxball.bench", "mjxball.sim.rigs"),
+    *("mjxball.bench", "mjxball.sim.rigs", "mjxball.algorithms.gradient"),
     *(f"mjxball.bench.{name}" for name in ("conditions", "draw", "success", "tracks")),
     *("mjxball.policy.container", "mjxball.policy.file", "mjxball.sim.disturbances", "mjxball.train.loop"),
     *("mjxball.train.program", "mjxfly.app.protocol", "mjxfly.view.live"),

@@ -176,10 +176,10 @@ class EnvironmentBatch(Protocol):
 class Algorithm(Protocol):
     """A learning algorithm. All its functions are pure, and can be jitted and vmapped.
 
-    Optional attributes: `prefers_cpu = True` if training on a CPU ends before a GPU program would be compiled, or no
-    GPU program can be; `large_products = True` if its matrix products are large enough for a GPU's cuBLAS; `averaged`,
-    names of the fields of its state that are means over environments after `collect`, so that these can be cut over
-    the devices of a CPU (`Shards`).
+    Optional attributes: `prefers_cpu`, true or a function of configuration and number of members, if training on a CPU
+    is faster, or no GPU program can be; `large_products = True` if its matrix products are large enough for a GPU's
+    cuBLAS; `averaged`, names of the fields of its state that are means over environments after `collect`, so that these
+    can be cut over the devices of a CPU (`Shards`).
     """
 
     schedule: Schedule

@@ -63,7 +63,7 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
         del extensions["algorithm"]
     physics = options.physics or "mjx"
     if extensions:
-        physics = _check_extensions(extensions, settings, options.physics, bool(options.distributed))
+        physics = _check_extensions(extensions, settings, options.physics, bool(options.distributed), members)
     origin: dict[str, Any] = {
         "command": command,
         "seed": seed,
@@ -187,12 +187,14 @@ def _refuse_settings_of_others(options: argparse.Namespace) -> None:
             )
 
 
-def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None, distributed: bool) -> str:
+def _check_extensions(
+    names: dict[str, str], settings: config.Config, wanted: str | None, distributed: bool, members: int
+) -> str:
     """The physics engine to train on. Raises InputError for an extension that is not found or does not fit."""
     from mjxball.train.extensions import Extensions, make_env, resolve
 
     extensions = resolve(Extensions(**names))
-    _choose_processor(extensions.algorithm)
+    _choose_processor(extensions.algorithm, settings, members)
     if not distributed:
         wake_devices()
     engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
@@ -211,20 +213,21 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
     return physics
 
 
-def _choose_processor(algorithm: Any) -> None:
-    """Select the CPU, as two devices, with small loops compiled whole, for an algorithm that prefers it (`Algorithm`).
+def _choose_processor(algorithm: Any, settings: config.Config, members: int) -> None:
+    """Select the CPU for an algorithm that prefers it (`Algorithm`), unless JAX_PLATFORMS is set.
 
-    JAX_PLATFORMS, if set, takes precedence.
+    Wherever such an algorithm trains on a CPU, that is two devices, with small loops compiled whole.
     """
     import jax
 
-    if not getattr(algorithm, "prefers_cpu", False):
+    prefers = getattr(algorithm, "prefers_cpu", False)
+    if not prefers:
         return
     compile_small_loops_whole()
     use_two_cpu_devices()
-    if not os.environ.get("JAX_PLATFORMS"):
-        settings: Any = jax.config
-        settings.update("jax_platforms", "cpu")
+    if not os.environ.get("JAX_PLATFORMS") and (prefers(settings, members) if callable(prefers) else prefers):
+        of_jax: Any = jax.config
+        of_jax.update("jax_platforms", "cpu")
 
 
 def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
@@ -239,7 +242,7 @@ def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     if extensions.get("algorithm"):
         from mjxball.train.extensions import find
 
-        _choose_processor(find(extensions["algorithm"], "--algorithm"))
+        _choose_processor(find(extensions["algorithm"], "--algorithm"), settings, origin["seeds"])
     if changed:
         raise InputError(f"{run} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
     return settings, origin

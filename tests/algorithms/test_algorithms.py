@@ -454,3 +454,12 @@ def test_environments_have_episodes_of_each_length_and_begin_them_in_turn():
         np.array([begins_episode(turn, windows, (4,)) for windows in range(8)])
         == ((turn + np.arange(8)[:, None]) % 4 == 0)
     ).all()
+
+
+def test_only_small_trainings_prefer_the_cpu() -> None:
+    """`quick` trains within two minutes there; `balance` would take hours beside a GPU that is idle."""
+    prefers = FirstOrderGradient.prefers_cpu
+    assert prefers(preset("quick"), 1)
+    assert prefers(preset("transport"), 4)
+    assert not prefers(preset("quick"), 64)
+    assert not any(prefers(preset(name), 1) for name in ("balance", "universal"))
