@@ -38,8 +38,8 @@ import numpy as np
 from harness import say, table, write
 from mjxball import config as configs
 from mjxball.env import TransportEnv
+from mjxball.foreign import from_brax, from_sb3
 from mjxball.policy import PolicyFile, load_network, save_file
-from mjxball.policy.foreign import from_brax, from_sb3
 from mjxball.xla import enable_compilation_cache
 from training import NO_CACHE, evaluate, launch, until_policy
 
@@ -99,7 +99,7 @@ def train_brax(config: configs.Config, options: argparse.Namespace, export: Expo
 
     def snapshot(steps: int, _: Any) -> None:
         if steps:
-            export(steps, from_brax(newest[0], config, steps=steps))
+            export(steps, from_brax(newest[0], config, normalize_observations=True, steps=steps, masked=True))
 
     acting.Evaluator.run_evaluation = look
     sizes, ppo = options.sizes, config.ppo
@@ -150,7 +150,8 @@ def train_sb3(config: configs.Config, options: argparse.Namespace) -> PolicyFile
 
     torch.set_num_threads(1)
     is_ppo, ppo = options.trainer == "sb3-ppo", config.ppo
-    mask = np.array(TransportEnv(config, options.physics).input_mask, np.float32)
+    env = TransportEnv(config, options.physics)
+    mask = np.array(env.input_mask[: env.policy_input_size], np.float32)
 
     class MaskedWorlds(VecEnvWrapper):
         """Observations with zeros where the preset's networks look away."""
@@ -166,7 +167,7 @@ def train_sb3(config: configs.Config, options: argparse.Namespace) -> PolicyFile
 
     worlds = FollowerVecEnv(options.num_envs, config=config, physics=options.physics, tanh=is_ppo)
     # A policy file does not clip what its network sees.
-    env = VecNormalize(MaskedWorlds(worlds), norm_reward=is_ppo, gamma=options.discount, clip_obs=np.inf)
+    trained_on = VecNormalize(MaskedWorlds(worlds), norm_reward=is_ppo, gamma=options.discount, clip_obs=np.inf)
     is_sbx = options.trainer == "sbx-sac"
     activation: Any = jax.nn.relu if is_sbx else torch.nn.ReLU
     own: dict[str, Any] = {
@@ -185,11 +186,11 @@ def train_sb3(config: configs.Config, options: argparse.Namespace) -> PolicyFile
         own |= {"batch_size": options.batch, "train_freq": 1, "gradient_steps": options.updates}
     library = importlib.import_module("sbx" if is_sbx else "stable_baselines3")
     kind = library.PPO if is_ppo else library.SAC
-    model = kind("MlpPolicy", env, seed=options.seed, device="cpu", **own)
+    model = kind("MlpPolicy", trained_on, seed=options.seed, device="cpu", **own)
     model.learn(options.steps)
-    env.training = False
+    trained_on.training = False
 
-    return from_sb3(model, config)
+    return from_sb3(model, config, masked=True)
 
 
 def mean_return(network: Callable[[np.ndarray], np.ndarray], config: configs.Config, physics: str) -> float:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from leaderboard import KINDS, best
 from mjxball.bench import CONDITIONS
+from mjxball.cli import make_parser
 from mjxball.running import run_command
 
 REPOSITORY = Path(__file__).parents[1]
@@ -27,31 +28,26 @@ ROWS = {
 RESULTS = REPOSITORY / "benchmarks" / "results"
 FIRST = {  # what README trains
     RESULTS / "first_command.json": (
-        "The first command trains a follower for a pair with {shares} % (calm/disturbed) in {seconds} s on two cores,"
+        "The first command below trains a follower for a pair in {seconds} s on two cores: {shares} %."
     ),
-    RESULTS
-    / "first_command_sac.json": "the paper's way, `--algorithm sac` on MJX, one with {shares} % in {seconds} s.",
+    RESULTS / "first_command_sac.json": "The paper's way, `--algorithm sac` on MJX: {shares} % after {seconds} s.",
 }
 
 
 def row(track: str, text: str) -> str:
-    """One line of the table: the best of each kind with disturbances; the better one is bold."""
-    found = {kind: best(names, track, CONDITIONS[-1]) for kind, names in KINDS.items()}
-    most = max(share for share, _ in found.values())
-    shown = [text]
-    for kind in ("classical", "learned"):
-        share, entries = found[kind]
-        who = ", ".join(f"`{entry['follower']}`" for entry in entries)
-        cell = f"{who} {share:.0f}" if entries else "-"
-        shown.append(f"**{cell}**" if share == most and entries else cell)
-    return " | ".join(shown)
+    """One line of the table: the best of each kind in each condition, the better one bold."""
+    return " | ".join([text, *(cell(track, condition) for condition in CONDITIONS)])
 
 
-def leads() -> str:
-    """In how many of the tasks a classical follower is better without disturbances."""
-    both = [[best(KINDS[kind], track, CONDITIONS[0])[0] for kind in ("classical", "learned")] for track in ROWS]
-    ahead = sum(classical > learned for classical, learned in both)
-    return f"In calm flights a classical follower leads in {ahead} of these {len(both)} tasks."
+def cell(track: str, condition: str) -> str:
+    """The best classical and the best learned follower, and how often they succeed."""
+    found = [best(KINDS[kind], track, condition) for kind in ("classical", "learned")]
+    most, shown = max(share for share, _ in found), []
+    for share, entries in found:
+        if entries:
+            text = ", ".join(f"`{one['follower']}`" for one in entries) + f" {share:.0f}"
+            shown.append(f"**{text}**" if share == most else text)
+    return ", ".join(shown) or "-"
 
 
 def sentences() -> list[str]:
@@ -68,12 +64,13 @@ def sentences() -> list[str]:
 
 def block() -> str:
     """The text of the block."""
-    table = ["task | best classical | best learned", "---|---|---", *(row(*one) for one in ROWS.items())]
-    return "\n".join(["", *table, "", leads(), *sentences(), "", ""])
+    table = ["task | calm | disturbed", "---|---|---", *(row(*one) for one in ROWS.items())]
+    return "\n".join(["", *table, "", *sentences(), "", ""])
 
 
 def main() -> int:
     """Rewrite the block."""
+    make_parser("python docs/readme.py", __doc__).parse_args()
     README.write_text(BLOCK.sub(lambda _: block(), README.read_text()))
     return 0
 

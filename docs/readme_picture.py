@@ -34,13 +34,13 @@ from mjxball.sim.rollout import simulate_batch
 SHOWN, SPEED = 20.0, 2  # [s], flight time over playing time
 FRAMES, TRAIL = 100, 10  # in all; of the path of O that is drawn
 LABELLED = {"leader": (26, 0, "lm"), "follower": (-26, 0, "rm"), "CG": (0, 34, "mm")}  # offsets [pixels], anchors
-DISTANCE, VIEW, FOVY = 1.78, (112.0, -24.0), math.radians(45)  # [m]; azimuth, elevation of Scene [degrees]; vertical
+DISTANCE, VIEW, FOVY = 2.5, (112.0, -24.0), math.radians(45)  # [m]; azimuth, elevation of Scene [degrees]; vertical
 PANE, HEAD, STRIP = (300, 236), 62, 166  # width and height of a view, heights of the names and of the curves [pixels]
 LEFT, RIGHT, TOP, BOTTOM = 84, 14, 16, 34  # of the curves within the strip [pixels]
 LOW, HIGH = 1e-3, 3.0  # ends of the error axis [m]
 TICKS = {1e-3: "1 mm", 1e-2: "1 cm", 1e-1: "10 cm", 1.0: "1 m"}
 INK, PALE, PAPER = (29, 35, 41), (214, 219, 224), (255, 255, 255)
-COLOURS = 128  # of the GIF
+COLOURS = 96  # of the GIF
 SMALL, MIDDLE, LARGE = (ImageFont.load_default(size) for size in (20, 26, 28))
 
 

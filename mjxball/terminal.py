@@ -5,6 +5,7 @@ rich takes 40 ms to import, but flax imports it anyway.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import os
@@ -26,7 +27,7 @@ Lines = Sequence[Sequence[str]]  # lines, each a list of parts, the most importa
 
 def is_live(stream: TextIO) -> bool:
     """Whether `stream` is a terminal that can redraw a line."""
-    return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
+    return not stream.closed and stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
 
 
 def columns_of(stream: TextIO) -> int:
@@ -101,10 +102,15 @@ class Status:
     """
 
     def __init__(self, stream: TextIO | None = None):
-        self._stream = stream or sys.stderr
-        self.live = is_live(self._stream)
+        self._given = stream
+        self.live = self._stream is not None and is_live(self._stream)
         self._shown: Callable[[], Lines] = list
         self._display: Any = None
+
+    @property
+    def _stream(self) -> Any:
+        """The stream; stderr as it is now, which another status may redirect above its lines, or None if closed."""
+        return self._given or sys.stderr
 
     def show(self, lines: Callable[[], Lines]) -> None:
         """Show the result of `lines`, which is called again every `PERIOD`."""
@@ -122,9 +128,12 @@ class Status:
 
     def row(self, parts: Sequence[str]) -> None:
         """Print `parts` permanently on one line; at a terminal as many as fit."""
-        self._print(fitted(parts, columns_of(self._stream)) if self._stream.isatty() else GAP.join(parts))
+        fits = self._stream is not None and self._stream.isatty()
+        self._print(fitted(parts, columns_of(self._stream)) if fits else GAP.join(parts))
 
     def _print(self, text: str) -> None:
+        if self._stream is None:
+            return
         if self._display is None:
             print(text, file=self._stream, flush=True)
         else:
@@ -175,6 +184,10 @@ class Working:
         return [self._text, *share, f"{time.monotonic() - self._began:.0f} s"]
 
     def _report(self) -> None:
+        with contextlib.suppress(OSError, ValueError):  # a stream that is closed or full stops no work
+            self._say()
+
+    def _say(self) -> None:
         if self._ended.wait(SOON):
             return
         if self._status.live:

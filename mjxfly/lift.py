@@ -24,6 +24,7 @@ WINDOW = 0.5  # [s] over which the rate of the voltage is measured
 SCARCE = 1.05  # lift over weight below which a drone gets full thrust in a descent
 ALL = 1.2  # full thrust in a descent, over hover thrust
 LEVELLING = (2.5, 1.0)  # thrust over hover taken from the higher end of the stick, per m and per m/s
+BRAKING = 0.25  # the same from the end that lags in a motion along the stick, per m/s
 CLIMBS = 0.25  # [m/s] vertical speed that proves that there is lift
 SETTLE = 0.5  # [s] of a landing beyond the time of its descent
 
@@ -80,10 +81,12 @@ class LiftWatch:
         self._disproved = self._disproved or (seen is not None and float(seen.velocity[2]) > CLIMBS)
         if self.share > SCARCE or self._disproved:
             return [wanted, wanted]
-        up, rising = 0.0, 0.0  # the leader above the follower [m], and how fast [m/s]
+        up, rising, along = 0.0, 0.0, 0.0  # the leader above the follower [m], how fast [m/s]; motion toward it [m/s]
         if seen is not None:
             up = float(seen.matrix[2] @ rig.span)
             rising = float(seen.matrix[2] @ rotations.cross(seen.rates, rig.span))
-        excess = LEVELLING[0] * up + LEVELLING[1] * rising
+            stick = seen.matrix[:2] @ rig.span
+            along = float(seen.velocity[:2] @ stick) / max(float(np.linalg.norm(stick)), 1e-6)
+        excess = LEVELLING[0] * up + LEVELLING[1] * rising - BRAKING * along
         most = [ALL if share < SCARCE else self.share for share in self.shares]
         return [most[0] - max(excess, 0.0), most[1] - max(-excess, 0.0)]

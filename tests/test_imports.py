@@ -31,7 +31,7 @@ FLOORS = (
     {"assembly"},
     {"physics", "scene"},
     {"rewards", "sim"},
-    {"env"},
+    {"env", "foreign"},
     {"algorithms"},
     {"train"},
     {"evaluate"},

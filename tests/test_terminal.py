@@ -203,3 +203,13 @@ def test_working_says_what_lasts_and_how_far_it_is(
         time.sleep(0.5)
     first, second, *_ = capsys.readouterr().err.splitlines()
     assert (first, second) == ("flying 2 followers ...", "flying 2 followers  25%  0 s")
+
+
+def test_work_goes_on_without_stderr(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "SOON", 0.01)
+    for stream in (None, io.StringIO()):
+        if stream:
+            stream.close()
+        monkeypatch.setattr(sys, "stderr", stream)
+        with Working("flying"):
+            time.sleep(0.05)

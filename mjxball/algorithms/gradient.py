@@ -30,7 +30,8 @@ from mjxball.scalar_form import scalar_form
 SMALL_RESPONSE = 1e-3  # response to a unit impulse, in deviations of observations and in actions, that is negligible
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
 IMPULSE_RESPONSE_FROM = 0.75  # share of the training after which the impulse response counts
-# Environments of which two cores compute a gradient (115 000 steps/s) in the 0.25 s that an H200 takes for any number.
+# Environments of a pair whose gradient two cores (115 000 steps/s) compute in the 0.25 s that an H200 takes for any
+# number of them. Those of larger teams take longer.
 MOST_ON_CPU = 200
 LEAST_DEVIATION = 0.02  # of an observation, so that one which hardly moves in the first window is not amplified
 
@@ -90,7 +91,7 @@ class FirstOrderGradient:
     @staticmethod
     def prefers_cpu(config: Config, members: int) -> bool:
         """Whether two cores train as fast as a GPU, whose time hardly depends on the number of environments."""
-        return members * config.gradient.num_envs <= MOST_ON_CPU
+        return members * config.gradient.num_envs * config.plant.count / 2 <= MOST_ON_CPU
 
     def __init__(self, config: Config, environments: EnvironmentBatch):
         settings = config.gradient

@@ -52,7 +52,7 @@ def known_success(track: str) -> dict[str, Success]:
     """Success of the followers in `KNOWN`, as stored if that is of this policy and these flights, else flown."""
     try:
         stored = read_stored(f"{track}-known")
-        if all(stored[name] == value for name, value in _flown_in(track).items()):
+        if tuple(stored["success"]) == KNOWN[track] and stored.items() >= _flown_in(track).items():
             return dict(stored["success"])
     except InputError:  # nothing is stored, or there are no policies
         pass

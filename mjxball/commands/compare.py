@@ -19,7 +19,7 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
 
     The metrics also go into the metadata of the exported policy file, and the learning curves to eval/members.png.
     """
-    from mjxball.commands.followers import flown
+    from mjxball.commands.followers import fly_and_say
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import table
     from mjxball.policy.file import load_file, save_file
@@ -27,7 +27,7 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
     reference = standard_scenarios(settings)[0]
-    results = flown(settings, policies, [reference], origin["physics"])
+    results = fly_and_say(settings, policies, [reference], origin["physics"])
     print(table(results, reference))
     compared = ("rmse", "settling_time", "x_peak", "overshoot")
     exported = load_file(out / POLICY)
@@ -75,14 +75,14 @@ def compile_ahead(settings: config.Config, physics: str) -> None:
 def compare(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
     """Compare the exported policy with `copy` on the plant and engine of training; figures go to `out`/eval."""
     from mjxball.baselines import make_baseline
-    from mjxball.commands.followers import flown
+    from mjxball.commands.followers import fly_and_say
     from mjxball.evaluate.plots import write_results
     from mjxball.evaluate.policies import check_bounds, load_policy
     from mjxball.evaluate.results import table
 
     scenarios = standard_scenarios(settings)
     trained = load_policy(policy, settings)
-    results = flown(settings, [make_baseline("copy", settings), trained], scenarios, physics)
+    results = fly_and_say(settings, [make_baseline("copy", settings), trained], scenarios, physics)
     print(table(results, scenarios[0]))
     with Working("drawing the figures"):
         write_results(results, out / "eval")

@@ -16,7 +16,7 @@ from mjxball.commands.followers import (
     add_flight,
     add_followers,
     add_policies,
-    flown,
+    fly_and_say,
     load,
     named,
     refuse_same_names,
@@ -126,7 +126,7 @@ def run(options: argparse.Namespace, command: str) -> int:
     written: list[Result] = []
     code = 0
     for number, (group, baselines, policies) in enumerate(loaded):
-        results = flown(group.setup, [*baselines, *policies], group.scenarios, options.physics)
+        results = fly_and_say(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")
         if options.plant or group.setup.plant != config.Plant():
@@ -171,7 +171,7 @@ def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[R
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:
-        known |= {result.follower: result for result in flown(plain, missing, [reference], physics)}
+        known |= {result.follower: result for result in fly_and_say(plain, missing, [reference], physics)}
     failed = False
     for policy in policies:
         misses = check_bounds(policy, known[policy.name].metrics)

@@ -112,9 +112,14 @@ def clock() -> Callable[[str], None]:
     return lambda text: status.say(f"{time.monotonic() - started:6.1f} s  {text}")
 
 
-def flown(setup: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str) -> list[Result]:
+def fly_and_say(
+    setup: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str
+) -> list[Result]:
     """`fly_scenarios`, which says on stderr how far it is."""
-    counts = (followers, "follower"), (scenarios, "scenario")
-    many, each = (f"{len(things)} {name}{'s' if len(things) > 1 else ''}" for things, name in counts)
-    with Working(f"flying {many} in {each}") as working:
+
+    def counted(things: Sequence[object], name: str) -> str:
+        return f"{len(things)} {name}{'s' if len(things) > 1 else ''}"
+
+    text = f"flying {counted(followers, 'follower')} in {counted(scenarios, 'scenario')}"
+    with Working(text) as working:
         return fly_scenarios(setup, followers, scenarios, physics, working)

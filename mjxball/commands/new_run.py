@@ -63,7 +63,9 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
         del extensions["algorithm"]
     physics = options.physics or "mjx"
     if extensions:
-        physics = _check_extensions(extensions, settings, options.physics, bool(options.distributed), members)
+        physics = _check_extensions(
+            extensions, settings, options.physics, bool(options.distributed), _members_here(options, members)
+        )
     origin: dict[str, Any] = {
         "command": command,
         "seed": seed,
@@ -84,6 +86,11 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     if extensions:
         origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
+
+
+def _members_here(options: argparse.Namespace, members: int) -> int:
+    """Members that this command trains, of all: those of its share."""
+    return members if options.share is None else max(members // shares.read(options.share)[1], 1)
 
 
 def chosen(options: argparse.Namespace) -> tuple[str, str]:

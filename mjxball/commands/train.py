@@ -77,7 +77,10 @@ def parser() -> cli.Parser:
     run.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     about = "begin with the weights of a policy file or shipped policy, or each member with those of a run's"
     run.add_argument("--start-from", type=policy_path, metavar="POLICY", help=about)
-    about = f"one of {', '.join(ALGORITHMS)} (default the preset's), or MODULE:CLASS, your own"
+    by = [name for name in config.PRESETS if config.algorithm_of(name) == "sac"]
+    about = (
+        f"one of {', '.join(ALGORITHMS)} (default: sac for {', '.join(by)}, else gradient), or MODULE:CLASS, your own"
+    )
     run.add_argument("--algorithm", metavar="NAME", help=about)
     about = "engine, mjx (default; SAC and PPO) or newton-euler, which is quicker (gradients: always)"
     run.add_argument("--physics", choices=TRAINING_ENGINES, metavar="ENGINE", help=about)
@@ -212,7 +215,7 @@ def _finish(
         return code
     print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)
     if code:
-        say(f"stopped, with exit code {code}; python train.py --resume {out} continues")
+        say(f"stopped, with exit code {code}; python train.py --resume {shlex.quote(str(out))} continues")
         return code
     plot_training(out, settings, out / "eval" / "training.png")
     if not is_evaluated(origin):

@@ -244,12 +244,9 @@ def _batch_of_one(leaves: Any) -> Any:
 
 
 def settings(preset: str, config: Config | None) -> Config:
-    """`config`, validated, or else the preset called `preset`, without what our own networks are.
-
-    Trainers have their own, without our GRU, which see positions too.
-    """
+    """`config`, validated, or else the preset called `preset`, without a GRU: trainers have their own networks."""
     valid = configs.preset(preset) if config is None else configs.validate(config)
-    return configs.replace(configs.replace(valid, "follower.recurrent_units", 0), "follower.ignore_position", False)
+    return configs.replace(valid, "follower.recurrent_units", 0)
 
 
 def pair_settings(preset: str, config: Config | None) -> Config:

@@ -1,6 +1,6 @@
 """Stable-Baselines3: many worlds of the follower's task in one compiled program, as its `VecEnv`.
 
-`mjxball.policy.foreign.from_sb3` makes a policy file of what it trains.
+`mjxball.foreign.from_sb3` makes a policy file of what it trains.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ except ModuleNotFoundError:
     ) from None
 
 from mjxball.config import Config
+from mjxball.foreign import TANH_IS_ONE
 from mjxball.gym.vector import FollowerVectorEnv
-from mjxball.policy.foreign import TANH_IS_ONE
 
 
 class FollowerVecEnv(VecEnv):
@@ -39,7 +39,8 @@ class FollowerVecEnv(VecEnv):
         tanh: bool = False,
     ):
         self._env = FollowerVectorEnv(num_envs, preset, config, physics, autoreset_mode="SameStep")
-        self.config, self._tanh, self._seed = self._env.config, tanh, 0
+        self.config, self._tanh = self._env.config, tanh
+        self._seed: int | None = None  # of the next reset; None goes on with the random chain
         box = self._env.single_action_space
         wide = gymnasium.spaces.Box(-TANH_IS_ONE, TANH_IS_ONE, box.shape, np.float32)
         self.render_mode = None
@@ -47,12 +48,13 @@ class FollowerVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Of the next `reset`: world i has `seed` + i."""
-        self._seed = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+        self._seed = int(np.random.default_rng().integers(2**31)) if seed is None else int(seed)
         return [self._seed + world for world in range(self.num_envs)]
 
     def reset(self) -> np.ndarray:
         """First observations (N, n)."""
-        return self._env.reset(seed=self._seed)[0]
+        seed, self._seed = self._seed, None
+        return self._env.reset(seed=seed)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep `actions` (N, 3) for `step_wait`."""

@@ -225,13 +225,15 @@ def _simulated(source: str, changes: Mapping[str, Any], physics: str, plant: Pat
 def _facts(setup: configs.Config, trajectory: Trajectory, scenario: Scenario) -> tuple[tuple[str, str], ...]:
     """What was measured of a simulated flight, as the viewer shows it."""
     from mjxball.evaluate.metrics import measure_batch, rotor_limits
+    from mjxball.evaluate.running_metrics import STEADY_AFTER
 
     limits, leader = rotor_limits(setup.plant, [scenario]), setup.plant.leader
     (found,) = measure_batch(trajectory.batched(), setup.scenario.termination_distance, limits, leader)
     if found.failed:
         return (("flight", "failed"),)
     settled = "never" if found.settling_time is None else f"{found.settling_time:.2f} s"
-    late = () if np.isnan(found.peak) else (("largest error from 20 s on", f"{1e3 * found.peak:.1f} mm"),)
+    error = np.linalg.norm(trajectory.target - trajectory.position, axis=-1)[trajectory.time >= STEADY_AFTER]
+    late = (("largest error from 20 s on", f"{1e3 * error.max():.1f} mm"),) if error.size else ()
     return (("settles", settled), *late, ("rotor at its limit", f"{100 * (found.rotors_at_limit or 0):.1f} %"))
 
 

@@ -462,4 +462,4 @@ def test_only_small_trainings_prefer_the_cpu() -> None:
     assert prefers(preset("quick"), 1)
     assert prefers(preset("transport"), 4)
     assert not prefers(preset("quick"), 64)
-    assert not any(prefers(preset(name), 1) for name in ("balance", "universal"))
+    assert not any(prefers(preset(name), 1) for name in ("balance", "universal", "lost"))

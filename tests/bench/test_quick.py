@@ -49,8 +49,9 @@ def test_known_followers_are_stored_and_flown_only_if_they_changed(monkeypatch: 
     monkeypatch.setattr(quick, "fly_known", lambda track: {"flown": {"calm": 1.0}})
     for track in QUICK_TRACKS:
         assert list(known_success(track)) == list(KNOWN[track])
-    monkeypatch.setitem(KNOWN, "pair", ("lqg", "sac"))
-    assert known_success("pair") == {"flown": {"calm": 1.0}}
+    for others in (("lqg", "sac"), ("lqg-world", "balance")):
+        monkeypatch.setitem(KNOWN, "pair", others)
+        assert known_success("pair") == {"flown": {"calm": 1.0}}
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from mjxball.control import motors
 from mjxball.control.motors import MOTORS
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
-from mjxfly.lift import ALL, LiftWatch
+from mjxfly.lift import ALL, BRAKING, LiftWatch
 from mjxfly.limits import FlightSettings
 from mjxfly.policy_setup import command_maps, config_of
 from mjxfly.setpoints import CommandMap
@@ -257,6 +257,36 @@ def test_a_pair_without_lift_that_climbs_has_lift() -> None:
     for speed, shares in ((0.2, [ALL, ALL]), (0.3, [0.98, 0.98]), (-0.4, [0.98, 0.98])):
         rising = seen._replace(velocity=np.array([0.0, 0.0, speed]))
         assert watch.shared(0.98, rising, rig) == shares
+
+
+def test_without_lift_the_stick_leans_against_its_motion() -> None:
+    """The end behind gives less, so that the pair leans back; across the stick the drones brake by themselves."""
+    watch = LiftWatch(MOTORS["2.1"])
+    rig = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
+    for number in range(5):
+        watch.update([2.6, 2.6], command_maps(config_of(load_file(FLIGHT).metadata)), HEIGHT, 0.4, 0.01 * number)
+    turned = np.array([math.cos(0.25 * math.pi), 0.0, 0.0, math.sin(0.25 * math.pi)])  # the stick along -x
+    for quaternion, toward in ((np.array([1.0, 0.0, 0.0, 0.0]), (0.0, 1.0, 0.0)), (turned, (-1.0, 0.0, 0.0))):
+        seen = ObjectState(np.zeros(3), np.zeros(3), quaternion, np.zeros(3))
+        leader, follower = watch.shared(0.98, seen._replace(velocity=np.array(toward)), rig)
+        assert (leader, follower) == (ALL, pytest.approx(ALL - BRAKING))
+        leader, follower = watch.shared(0.98, seen._replace(velocity=-np.array(toward)), rig)
+        assert (leader, follower) == (pytest.approx(ALL - BRAKING), ALL)
+        across = np.array(toward)[[1, 0, 2]]
+        assert watch.shared(0.98, seen._replace(velocity=across), rig) == pytest.approx([ALL, ALL])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drone", [0, 1])
+def test_a_battery_that_gives_way_leaves_the_pair_where_it_is(drone: int) -> None:
+    """It leaned by 8 degrees and was 7 to 11 m away when it touched down."""
+    world = hovering()
+    before = world.state.position.mean(axis=0)
+    world.drones[drone].inject(FAULT_KINDS["battery"].what)
+    world.run(20.0)
+    assert world.flight.supervisor.cause.event is Event.LIFT
+    assert float(np.linalg.norm((world.state.position.mean(axis=0) - before)[:2])) < 2.0
+    assert world.touchdown_speed() < 0.6
 
 
 @pytest.mark.slow

@@ -287,8 +287,7 @@ def test_a_pickled_environment_goes_on_as_the_first_one(short: Config, duplicate
     with pytest.raises(gymnasium.error.ResetNeeded):
         new.step(STILL)
     flown = duplicate(PlaygroundEnv("transport", config=short, physics="newton-euler"))
-    seen = replace(short, "follower.ignore_position", False)  # trainers' networks see positions
-    assert (flown.config, flown._pair.backend) == (seen, "newton-euler")
+    assert (flown.config, flown._pair.backend) == (short, "newton-euler")
 
 
 ASYNC = """

@@ -387,3 +387,18 @@ def test_rotors_are_where_the_layout_puts_them(flight: Flight, browser: Any, tmp
 
 def test_a_flight_knows_its_plant(flight: Flight):
     assert flight.plant == Plant()
+
+
+def test_facts_of_a_simulated_flight() -> None:
+    flight = flight_from(str(TRANSPORT), {"seconds": 25.0}, "newton-euler")
+    facts = dict(flight.facts)
+    error = np.linalg.norm(flight["target"] - flight["position"], axis=-1)
+    assert facts["largest error from 20 s on"] == f"{1000 * error[flight['time'] >= 20].max():.1f} mm"
+    settled = float(facts["settles"].removesuffix(" s"))
+    after = error[flight["time"] > settled + 0.01]
+    assert after.max() <= 0.02 * error[0] < error[flight["time"] <= settled + 0.01][-2:].max() + 1e-3
+    assert [name for name, _ in flight_from(str(TRANSPORT), {"seconds": 5.0}, "newton-euler").facts] == [
+        "settles",
+        "rotor at its limit",
+    ]
+    assert dict(flight_from("random", {"seconds": 5.0}, "newton-euler").facts).get("settles") in (None, "never")

@@ -33,21 +33,23 @@ class _Learnt(NamedTuple):
     deviation: np.ndarray
 
 
-def from_sb3(model: Any, config: Config | None = None) -> PolicyFile:
+def from_sb3(model: Any, config: Config | None = None, masked: bool = False) -> PolicyFile:
     """The policy of a `model` of Stable-Baselines3 or SBX: SAC, or PPO behind `FollowerVecEnv(tanh=True)`.
 
-    `config` by default that of the environment. Statistics of a `VecNormalize` are part of the file, its `clip_obs` is
-    not. The file's actions on random observations are compared with `model.predict`. Raises InputError if they
-    differ, or for a network that a policy file cannot hold.
+    The model needs its environment, also after `load` (`env=...`). `config` is by default that of the environment.
+    Statistics of a `VecNormalize` are part of the file, its `clip_obs` is not. `masked` as of `from_layers`. The file's
+    actions on random observations are compared with `model.predict`. Raises InputError if they differ, or for a network
+    or an environment that a policy file cannot hold.
     """
-    env = model.get_env()
+    env, name = model.get_env(), type(model).__name__
+    if env is None:
+        raise InputError("the model has no environment, which may normalise observations; load it with env=...")
+    _check_wrappers(env)
     config = env.get_attr("config")[0] if config is None else config
     squashed = hasattr(model.policy, "actor") or hasattr(model.policy, "actor_state")
-    if not squashed and not np.allclose(model.action_space.high, TANH_IS_ONE):
-        raise InputError(
-            f"{type(model).__name__} clips its actions, and a policy file ends in tanh: train it on "
-            "mjxball.gym.sb3.FollowerVecEnv(tanh=True)"
-        )
+    if not np.allclose(model.action_space.high, 1.0 if squashed else TANH_IS_ONE):
+        why = "has a tanh of its own" if squashed else "clips its actions, and a policy file ends in tanh"
+        raise InputError(f"{name} {why}: train it on mjxball.gym.sb3.FollowerVecEnv(tanh={not squashed})")
     normalizer = model.get_vec_normalize_env()
     size = model.observation_space.shape[0]
     mean, deviation = np.zeros(size), np.ones(size)
@@ -59,26 +61,48 @@ def from_sb3(model: Any, config: Config | None = None) -> PolicyFile:
         actions = model.predict(seen, deterministic=True)[0]
         return actions if squashed else np.tanh(actions)
 
-    origin = {"trainer": f"{type(model).__module__}.{type(model).__name__}", "seed": model.seed}
-    return from_layers(_sb3_layers(model), config, mean, deviation, act, model.num_timesteps, origin)
+    origin = {"trainer": f"{type(model).__module__}.{name}", "seed": model.seed}
+    return from_layers(_sb3_layers(model), config, mean, deviation, act, model.num_timesteps, origin, masked)
+
+
+def _check_wrappers(env: Any) -> None:
+    """Raise InputError for more than one normalisation around a `VecEnv` of Stable-Baselines3, or inside it."""
+    import gymnasium
+
+    outer, normalised = env, 0
+    while outer is not None:
+        normalised += hasattr(outer, "obs_rms")
+        outer = getattr(outer, "venv", None)
+    inside = gymnasium.wrappers.NormalizeObservation
+    if normalised > 1 or any(env.env_is_wrapped(inside)):
+        raise InputError("the environment normalises observations elsewhere than in one VecNormalize")
 
 
 def from_brax(
-    parameters: Sequence[Any], config: Config, make_policy: Callable[..., Any] | None = None, steps: int = 0
+    parameters: Sequence[Any],
+    config: Config,
+    make_policy: Callable[..., Any] | None = None,
+    normalize_observations: bool = False,
+    steps: int = 0,
+    masked: bool = False,
 ) -> PolicyFile:
     """The policy in the `parameters` that `train` of Brax's SAC or PPO returns: (statistics, policy, ...).
 
-    With `make_policy`, which `train` returns too, the file's actions are compared with its own: Brax's PPO has swish
-    layers unless its `network_factory` says `activation=jax.nn.relu`. Raises InputError if they differ.
+    `normalize_observations` as given to `train`; `masked` as of `from_layers`. With `make_policy`, which `train`
+    returns too, the file's actions are compared with its own: Brax's PPO has swish layers unless its `network_factory`
+    says `activation=jax.nn.relu`. Raises InputError if they differ.
     """
     statistics, policy = parameters[0], parameters[1]
-    mean, deviation = (np.asarray(getattr(statistics, name), np.float64) for name in ("mean", "std"))
+    mean, deviation = None, None
+    if normalize_observations:
+        mean, deviation = statistics.mean, statistics.std
 
     def act(observations: np.ndarray) -> np.ndarray:
         assert make_policy is not None
         return np.asarray(make_policy(parameters, deterministic=True)(observations, None)[0])
 
-    return from_layers(policy, config, mean, deviation, act if make_policy else None, steps, {"trainer": "brax"})
+    origin = {"trainer": "brax"}
+    return from_layers(policy, config, mean, deviation, act if make_policy else None, steps, origin, masked)
 
 
 def from_layers(
@@ -89,18 +113,20 @@ def from_layers(
     act: Callable[[np.ndarray], np.ndarray] | None = None,
     steps: int = 0,
     origin: Mapping[str, Any] | None = None,
+    masked: bool = False,
 ) -> PolicyFile:
     """A policy file for `config` from the `layers` of a network with ReLU between them and tanh behind them.
 
     `layers`: (kernel (inputs, outputs), bias (outputs,)) of each, or Flax's parameters, or a state dict of PyTorch
     with kernels (outputs, inputs). The last one has 3 outputs (roll, pitch, vertical), or 6, the means before the
-    deviations. `config` is that of the environment (`mjxball.gym` sets `follower.ignore_position` false). `mean`,
-    `deviation` (n,) normalise the observations, which otherwise are not normalised. `act` maps observations (N, n) to
-    actions (N, 3) in [-1, 1] by the trained policy: InputError if the file's differ.
+    deviations. `mean`, `deviation` (n,) normalise the observations, which otherwise are not normalised. `masked`: the
+    trainer saw zeros in what `follower.ignore_position` hides; otherwise the file's network sees positions. `act` maps
+    observations (N, n) to actions (N, 3) in [-1, 1] by the trained policy: InputError if the file's differ.
     """
     from mjxball.sim.follower import network_interface
 
     own = replace(config, "follower.recurrent_units", 0)  # the trainer has its own network
+    own = replace(own, "follower.ignore_position", own.follower.ignore_position and masked)
     interface = network_interface(own)
     size = interface.input_size
     given = _layers_in(layers) if isinstance(layers, Mapping) else layers
@@ -115,11 +141,12 @@ def from_layers(
     for name, value in (("mean", mean), ("deviation", deviation)):
         if value.shape != (size,):
             raise InputError(f"{name} has the shape {value.shape}, and the observation here ({size},)")
+    if not (deviation > 0).all():
+        raise InputError("deviation must be positive")
     policy = policy_file(own, interface, _Learnt(named, mean, deviation), int(steps), dict(origin or {}))
     check(policy, "this network")
     if act is not None:
-        mask = action_mask(config.follower.load_axis_only, config.plant.cg_axis)
-        _compare(policy, lambda seen: np.asarray(act(seen)) * mask, mean, deviation)
+        _compare(policy, act, np.array(action_mask(config.follower.load_axis_only, config.plant.cg_axis)))
     return policy
 
 
@@ -151,8 +178,9 @@ def _layers_in(tree: Mapping[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
     leaves = dict(_leaves(tree, ()))
     found = []
     places = list(dict.fromkeys(path[:-1] for path in leaves))
-    if any(path[-1] == "kernel" for path in leaves):  # Flax sorts names as text
-        places.sort(key=lambda path: [int(number) for name in path for number in re.findall(r"\d+", name)])
+    numbers = {path: [int(one) for name in path for one in re.findall(r"\d+", name)] for path in places}
+    if any(path[-1] == "kernel" for path in leaves) and all(numbers.values()):  # Flax may sort names as text
+        places.sort(key=lambda path: numbers[path])
     for place in places:
         names = {path[-1] for path in leaves if path[:-1] == place}
         if names not in ({"kernel", "bias"}, {"weight", "bias"}):
@@ -173,11 +201,15 @@ def _leaves(tree: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...],
 
 def _array(value: Any) -> np.ndarray:
     """An array of NumPy, JAX or PyTorch as float32."""
-    value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
-    return np.asarray(value, np.float32)
+    found = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value)
+    if found.dtype.kind not in "fiu":
+        raise InputError(f"a layer has numbers of the type {found.dtype}")
+    return found.astype(np.float32)
 
 
 def _check_shapes(layers: Sequence[tuple[np.ndarray, np.ndarray]], size: int) -> None:
+    if not layers:
+        raise InputError("there are no layers")
     width = size
     for number, (kernel, bias) in enumerate(layers):
         wanted = f"layer {number} has the kernel {kernel.shape} and the bias {bias.shape}"
@@ -191,16 +223,19 @@ def _check_shapes(layers: Sequence[tuple[np.ndarray, np.ndarray]], size: int) ->
         raise InputError(f"the last layer has {width} outputs; an action has 3, with deviations 6")
 
 
-def _compare(
-    policy: PolicyFile, act: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, deviation: np.ndarray
-) -> None:
-    """Raise InputError if the file's actions differ from those of `act`."""
-    noise = np.random.default_rng(0).standard_normal((SAMPLES, len(mean)))
-    seen = ((mean + SPREAD * deviation * noise) * (policy.observation_scale > 0)).astype(np.float32)
+def _compare(policy: PolicyFile, act: Callable[[np.ndarray], np.ndarray], mask: np.ndarray) -> None:
+    """Raise InputError if the file's actions differ from those of `act`, times `mask` (3,)."""
+    scale = policy.observation_scale
+    deviation = 1 / np.where(scale > 0, scale, 1.0)
+    noise = np.random.default_rng(0).standard_normal((SAMPLES, len(scale)))
+    seen = ((policy.observation_mean + SPREAD * deviation * noise) * (scale > 0)).astype(np.float32)
+    answers = np.asarray(act(seen))
+    if answers.shape != (SAMPLES, ACTION_SIZE):
+        raise InputError(f"the trained policy answers {answers.shape} to {SAMPLES} observations; an action has 3")
     weights = [*policy.weights[:-1], policy.weights[-1][:, :ACTION_SIZE]]
     biases = [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
-    network = Network(weights, biases, policy.observation_mean, policy.observation_scale)
-    apart = float(np.abs(act(seen) - network(seen)).max())
+    network = Network(weights, biases, policy.observation_mean, scale)
+    apart = float(np.abs(answers * mask - network(seen)).max())
     if not apart < ROUNDING:
         raise InputError(
             f"the policy file's actions differ from the trained policy's by up to {apart:.2g}: a policy file has ReLU "

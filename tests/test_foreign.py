@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from mjxball.config import Config, preset, replace
 from mjxball.errors import InputError
-from mjxball.policy.foreign import from_brax, from_layers
+from mjxball.foreign import from_brax, from_layers
 from mjxball.policy.inference import Policy
 
 
@@ -34,8 +35,7 @@ class Tensor:
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    """As of `mjxball.gym`: the network sees positions."""
-    return replace(preset("transport"), "follower.ignore_position", False)
+    return preset("transport")
 
 
 def sampled(sizes: tuple[int, ...], seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -58,12 +58,15 @@ def answered(layers: list[tuple[np.ndarray, np.ndarray]], observations: np.ndarr
 def test_layers_flax_and_pytorch_give_the_same_file_which_answers_as_the_network(config: Config) -> None:
     layers = sampled((18, 16, 8, 4, 6))
     observations = np.random.default_rng(1).standard_normal((50, 18))
+    named = {
+        f"{name}": {"kernel": w, "bias": b} for name, (w, b) in zip(("fc1", "fc2", "fc3", "out"), layers, strict=True)
+    }
     flax = {"params": {f"Dense_{k}": {"kernel": w, "bias": b} for k, (w, b) in enumerate(layers)}}
     flax["params"] = dict(sorted(flax["params"].items(), reverse=True))
     torch: dict[str, Any] = {}
     for k, (w, b) in enumerate(layers):
         torch |= {f"{2 * k}.weight": Tensor(w.T), f"{2 * k}.bias": Tensor(b)}
-    for given in (layers, flax, torch):
+    for given in (layers, flax, torch, named):
         policy = from_layers(given, config, act=lambda seen: answered(layers, seen), steps=7)
         assert policy.metadata["training_steps"] == 7
         actions = Policy(policy, "mine").action(observations)
@@ -90,6 +93,8 @@ def test_three_outputs_are_enough_and_statistics_normalise(config: Config) -> No
         ([(np.zeros((18, 3)), np.zeros(4))], "the bias (4,); (inputs, outputs) and (outputs,) fit"),
         ({"Dense_0": {"kernel": np.eye(18), "scale": np.zeros(3)}}, "Dense_0 has kernel, scale: not a dense layer"),
         ({"log_std": np.zeros(3)}, "the network has log_std: not a dense layer"),
+        ([], "there are no layers"),
+        ([(1j * np.ones((18, 3)), np.zeros(3))], "a layer has numbers of the type complex128"),
     ],
 )  # fmt: skip
 def test_layers_that_do_not_fit_are_refused(config: Config, layers: Any, words: str) -> None:
@@ -106,15 +111,22 @@ def test_a_network_of_another_kind_is_refused(config: Config) -> None:
 
     with pytest.raises(InputError, match=r"actions differ from the trained policy's by up to .* has ReLU"):
         from_layers(layers, config, act=with_tanh)
+    with pytest.raises(InputError, match=r"answers \(256, 6\) to 256 observations; an action has 3"):
+        from_layers(layers, config, act=lambda seen: np.zeros((len(seen), 6)))
+    with pytest.raises(InputError, match="deviation must be positive"):
+        from_layers(layers, config, deviation=np.zeros(18))
     with pytest.raises(InputError, match=r"mean has the shape \(3,\), and the observation here \(18,\)"):
         from_layers(layers, config, np.zeros(3))
 
 
-def test_inputs_that_the_configuration_ignores_have_no_effect() -> None:
+def test_positions_have_an_effect_unless_the_trainer_saw_zeros_there() -> None:
+    """`transport` itself ignores positions; its environments show them."""
     layers, seen = sampled((18, 8, 3)), np.random.default_rng(3).standard_normal((9, 18))
-    policy = from_layers(layers, preset("transport"), act=lambda seen: answered(layers, seen))
     far = seen + np.array([5.0] * 3 + [0.0] * 15)
-    np.testing.assert_array_equal(Policy(policy, "mine").action(seen), Policy(policy, "mine").action(far))
+    for masked in (False, True):
+        policy = from_layers(layers, preset("transport"), act=lambda seen: answered(layers, seen), masked=masked)
+        actions = [Policy(policy, "mine").action(where) for where in (seen, far)]
+        assert np.array_equal(*actions) == masked
 
 
 def test_brax_networks(config: Config) -> None:
@@ -133,7 +145,9 @@ def test_brax_networks(config: Config) -> None:
     for number, (networks, make) in enumerate(made):
         parameters = statistics, networks.policy_network.init(jax.random.key(0))
         if number < 2:
-            from_brax(parameters, config, make(networks))
+            for normalize, spoilt in ((True, False), (False, True)):
+                with pytest.raises(InputError, match="other processing") if spoilt else contextlib.nullcontext():
+                    from_brax(parameters, config, make(networks), normalize)
         else:
             with pytest.raises(InputError, match="ReLU"):
-                from_brax(parameters, config, make(networks))
+                from_brax(parameters, config, make(networks), normalize_observations=True)
