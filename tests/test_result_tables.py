@@ -82,7 +82,7 @@ def first() -> Iterator[tuple[str, Numbers]]:
         yield f"seed {row['seed']}{warm}", [scale * row[name] for name, scale in columns.items()]
     own, cost = found["again"], {"rotor_power": 1, "rotor_limit_share": 100}
     costs = [scale * own[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "world")]
-    yield "seed 0, again", [100 * own["calm"], 100 * own["world"], *costs]
+    yield "seed 0, with another noise", [100 * own["calm"], 100 * own["world"], *costs]
     (sac,) = measured("first_command_sac")["rows"]
     yield "--algorithm sac", [scale * sac[name] for name, scale in columns.items()]
     for name in ("lqg", "lqg-world", "balance"):
