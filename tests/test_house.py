@@ -35,7 +35,7 @@ def test_what_ci_leaves_out_runs_every_week() -> None:
     assert workflow[True]["schedule"]  # `on` in YAML
     *_, whole, foreign, held = (step.get("run", "") for step in workflow["jobs"]["test"]["steps"])
     assert whole.endswith("-m release")
-    assert {"kubeflow-trainer-api", "skypilot", "wandb", "mlflow-skinny"} == {
+    assert {"kubeflow-trainer-api", "skypilot", "wandb", "mlflow-skinny", "stable-baselines3"} == {
         part.partition("==")[0] for part in foreign.split() if "==" in part
     }
     assert "tests/test_manifests.py tests/train/test_tracker.py" in held
