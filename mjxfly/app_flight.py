@@ -53,7 +53,7 @@ class OnboardApps:
         ident = int(self._read(link, ("ident",))["ident"])
         if ident not in self.idents:
             raise InputError(
-                f"the follower carries another policy than {self.name}: export it with --crazyflie and flash it"
+                f"the follower carries another policy than {self.name}: export it by python -m mjxfly.app and flash it"
             )
         kind = "8 bit" if ident == self.idents[1] else "float32"
         say(f"on board: {self.name}, {kind} weights")
