@@ -76,11 +76,12 @@ def lost() -> Iterator[tuple[str, Numbers]]:
 
 def first() -> Iterator[tuple[str, Numbers]]:
     columns = {"policy": 1, "command": 1, "calm": 100, "world": 100}
-    found = measured("first_command")
+    found, cost = measured("first_command"), {"rotor_power": 1, "rotor_limit_share": 100}
     for row in found["rows"]:
         warm = ", warm" if row["cache"] == "warm" else ""
-        yield f"seed {row['seed']}{warm}", [scale * row[name] for name, scale in columns.items()]
-    own, cost = found["again"], {"rotor_power": 1, "rotor_limit_share": 100}
+        costs = [scale * row[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "world")]
+        yield f"seed {row['seed']}{warm}", [*(scale * row[name] for name, scale in columns.items()), *costs]
+    own = found["again"]
     costs = [scale * own[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "world")]
     yield "seed 0, with another noise", [100 * own["calm"], 100 * own["world"], *costs]
     (sac,) = measured("first_command_sac")["rows"]
