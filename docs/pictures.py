@@ -347,6 +347,7 @@ def tutorial(out: Path) -> None:
 
     text = (REPOSITORY / "docs" / "tutorial.md").read_text()
     blocks = "".join(re.findall(r"^```bash\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE))
+    blocks = blocks[blocks.index("python train.py") :]  # what comes before opens a browser
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         commands = [line for line in blocks.replace("\\\n", " ").splitlines() if line.startswith("python ")]

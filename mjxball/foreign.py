@@ -1,7 +1,7 @@
 """Policies of other trainers as policy files: Stable-Baselines3, SBX, Brax, or the layers of any ReLU network.
 
 A policy file holds a network with ReLU layers whose outputs go through tanh. What is not such a network is refused, and
-so is a file that would not answer as the trained policy does. Only NumPy is imported.
+so is a file that would not answer as the trained policy does.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _check_wrappers(env: Any) -> None:
 
     outer, normalised = env, 0
     while outer is not None:
-        normalised += hasattr(outer, "obs_rms")
+        normalised += "obs_rms" in vars(outer)  # a wrapper passes on what it has not
         outer = getattr(outer, "venv", None)
     inside = gymnasium.wrappers.NormalizeObservation
     if normalised > 1 or any(env.env_is_wrapped(inside)):

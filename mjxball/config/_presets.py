@@ -16,7 +16,6 @@ from mjxball.errors import InputError
 
 
 def _paper() -> Config:
-    """The paper's reward and SAC: the follower learns the leader's commands, and the load sways."""
     return Config(
         preset="paper",
         follower=Follower(action="direct", action_scale_tilt=0.6, action_scale_vertical=6.0, ignore_position=False),
@@ -46,7 +45,6 @@ def _paper() -> Config:
 
 
 def _transport() -> Config:
-    """A pair, masses near the plant's, exact sensors: SAC learns it within a minute on two cores."""
     return Config(
         preset="transport",
         scenario=ScenarioRanges(

@@ -15,7 +15,7 @@ sb3 = pytest.importorskip("stable_baselines3")
 pytestmark = pytest.mark.release
 
 from stable_baselines3.common.env_checker import check_env  # noqa: E402
-from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize  # noqa: E402
 
 from mjxball.gym.sb3 import FollowerVecEnv  # noqa: E402
 from mjxball.gym.single import FollowerEnv  # noqa: E402
@@ -68,4 +68,5 @@ def test_what_a_policy_file_cannot_hold_is_refused() -> None:
         from_sb3(sb3.PPO("MlpPolicy", wide))
     with pytest.raises(InputError, match="normalises observations elsewhere"):
         from_sb3(sb3.SAC("MlpPolicy", VecNormalize(VecNormalize(FollowerVecEnv(2)))))
+    from_sb3(sb3.SAC("MlpPolicy", VecMonitor(VecNormalize(FollowerVecEnv(2)))))
     from_sb3(sb3.PPO("MlpPolicy", wide, policy_kwargs={"activation_fn": torch.nn.ReLU}))
