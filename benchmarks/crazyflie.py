@@ -35,7 +35,7 @@ from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache
 
 SECONDS, SETTLED = 20.0, 5.0
-CLASSICAL = ("copy", "adaptive", "lqg", "lqg-calm", "lqg-world")
+CLASSICAL = ("copy", "adaptive", "lqg", "lqg-calm", "lqg-disturbed")
 
 
 def followers(path: Path, config: Config) -> list[Follower]:

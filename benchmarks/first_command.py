@@ -43,7 +43,7 @@ def main(given: Sequence[str] | None = None) -> int:
             rows[-1] |= trained(seed, out, cache, more)
             say(rows[-1])
     cold = [row for row in rows if row["cache"] == "empty"]
-    median = medians(cold, ("command", "policy", "calm", "world"))
+    median = medians(cold, ("command", "policy", "calm", "disturbed"))
     say({"median": "", **median})
     write(options.json, {"track": TRACK, "arguments": more, "rows": rows, "median": median})
     return 0

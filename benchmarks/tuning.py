@@ -1,6 +1,6 @@
 """The tuning of the references of mjxball-bench: a search on flights that no table reports.
 
-`python benchmarks/tuning.py CONTROLLER [--track TRACK ...] [--condition both|calm|world] [--sets N] [--rounds N]
+`python benchmarks/tuning.py CONTROLLER [--track TRACK ...] [--condition both|calm|disturbed] [--sets N] [--rounds N]
 [--flights N] [--plants N] [--width W] [--cores N] [--log FILE]`
 
 CMA-ES (Hansen) over the logarithms of a controller's tuning; it starts from that which the controller has for both

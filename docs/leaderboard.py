@@ -42,7 +42,7 @@ def entries() -> list[dict[str, Any]]:
 
 
 def table(track: str) -> str:
-    """The rows of one track, the most successful in the world first."""
+    """The rows of one track, the most successful in disturbed flights first."""
     flown = [entry for entry in entries() if track in entry["tracks"]]
     flown.sort(
         key=lambda entry: [entry["tracks"][track][one]["succeeded"] for one in reversed(CONDITIONS)], reverse=True

@@ -89,7 +89,7 @@ def flights(names: list[str | Path], scenario: Scenario, path: Path, panels: tup
 
 def copying(out: Path) -> None:
     """Page mimicking: what copying the leader does to the object."""
-    flights(["copy", "lqg", "transport"], REFERENCE, out / "copying.svg")
+    flights(["copy", "lqg", "transport-large"], REFERENCE, out / "copying.svg")
 
 
 def cancels(out: Path) -> None:

@@ -85,7 +85,7 @@ def main() -> None:
 def median_flight() -> tuple[Config, Scenario, float]:
     """(configuration, scenario, radius of success [m]) of the flight that is shown."""
     config, flights = quick_group("pair")
-    disturbed = [one for one in flights if one.condition == "world"]
+    disturbed = [one for one in flights if one.condition == "disturbed"]
     scenarios = [with_seed(one, KEY, 0) for one in disturbed]
     flown = simulate_batch(config, [(make_baseline("lqg", config), scenarios)], ENGINE)
     error = np.linalg.norm(flown.target - flown.position, axis=-1)

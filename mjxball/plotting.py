@@ -22,9 +22,9 @@ SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(
 )
 # For each dash the followers in the order of COLOURS. Followers that often share a figure differ in colour too.
 TABLE = (
-    (SOLID, ("stand", "flight", "balance", "universal", "sac", "flight-upgrade")),
-    (DASH_DOT_DOT, ("lost", "robust", "", "transport", "flight-brushless", "paper")),
-    (DASH, ("", "", "", "lqg-calm", "lqg-world", "lqg")),
+    (SOLID, ("stand", "flight", "balance", "universal", "balance-sac", "flight-upgrade")),
+    (DASH_DOT_DOT, ("lost", "robust", "", "transport-large", "flight-brushless", "paper")),
+    (DASH, ("", "", "", "lqg-calm", "lqg-disturbed", "lqg")),
     (DASH_DOT, ("mpc", "copy", "pid", "adaptive", "observer", "adaptive-mass")),
     (DOT, ("oracle", "", "", "", "random", "stay")),
 )

@@ -11,7 +11,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.export import flight_record
 
-NAMES = ("lqg", "lqg-calm", "lqg-world")
+NAMES = ("lqg", "lqg-calm", "lqg-disturbed")
 PLANT = "crazyflie"  # shipped plant that they fly unless another is named
 
 

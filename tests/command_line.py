@@ -18,7 +18,7 @@ import pytest
 from mjxball.xla import SMALL_LOOPS
 
 REPOSITORY = Path(__file__).parents[1]
-TRANSPORT = REPOSITORY / "policies" / "archive" / "transport.npz"
+TRANSPORT = REPOSITORY / "policies" / "archive" / "transport-large.npz"
 Main = Callable[[list[str]], int]
 # Programs of tests are small and run once: to optimise them little takes half off the time of tests that compile, most
 # of it by XLA's older emitters of loops. Level 0 compiles no sooner than level 1 and computes four times as slowly.

@@ -101,12 +101,12 @@ def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) 
     script = (
         "from mjxball.policy import Policy, shipped_policies, shipped_policy\n"
         "assert all(Policy.load(path) for path in shipped_policies())\n"
-        "print(shipped_policy('transport'), len(shipped_policies()))"
+        "print(shipped_policy('transport-large'), len(shipped_policies()))"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path, timeout=60
     )
-    expected = tmp_path / "mjxball" / "policies" / "archive" / "transport.npz"
+    expected = tmp_path / "mjxball" / "policies" / "archive" / "transport-large.npz"
     assert done.stdout.split() == [str(expected), str(len(shipped_policies()))]
 
 
@@ -123,6 +123,7 @@ WORKS = {
         "mjxball-eval balance",
         "mjxball-eval universal --plant team3 --seconds 1",
         "mjxball-eval bench balance --tracks pair --out entry.json",
+        "mjxball-eval --followers mpc --seconds 1",
         "python -m mjxball.view balance --seconds 2 --out flight.html",
     ],
     "fly": [FLIGHT, *(f"python -m mjxfly.log flight.jsonl flight.{kind}" for kind in ("mcap", "parquet"))],
@@ -137,7 +138,6 @@ WORKS = {
         "jaxmarl.LogWrapper(FollowersMultiAgentEnv()).reset(jax.random.key(0))'"
     ],
     "onnx": ["python -m mjxball.export flight flight.onnx"],
-    "train,mpc": ["mjxball-eval --followers mpc --seconds 1"],
     "view": ["python -m mjxball.view flight --seconds 2 --out flight.html"],
     "video": ["python -m mjxball.view flight --seconds 1 --video flight.mp4"],
     "docs": ["python -c 'import furo, myst_parser, nbclient, sphinx'"],
@@ -187,7 +187,7 @@ def test_the_sdist_builds_the_same_wheel(built: Path, wheel: Path, tmp_path: Pat
 
 def test_a_source_tree_finds_the_policies_beside_it() -> None:
     assert {path.parent for path in shipped_policies()} == {REPOSITORY / "policies"}
-    assert Policy(load_file(shipped_policy("transport")), "transport").name == "transport"
+    assert Policy(load_file(shipped_policy("transport-large")), "transport-large").name == "transport-large"
 
 
 def test_an_unknown_policy_is_refused_with_the_names_of_those_there_are() -> None:

@@ -71,8 +71,8 @@ def entered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_the_block_has_a_row_for_every_task_and_names_the_best(entered: Any) -> None:
-    usual = {"calm": results(), "world": results(late_error_90=0.018)}
-    better = {**usual, "world": {**reasons(rotors=9), "succeeded": 101, "late_error_90": 0.018}}
+    usual = {"calm": results(), "disturbed": results(late_error_90=0.018)}
+    better = {**usual, "disturbed": {**reasons(rotors=9), "succeeded": 101, "late_error_90": 0.018}}
     empty = entered()
     text = entered(copy={"pair": usual}, lqg={"pair": better, "pair-unknown": usual}, balance={"pair": usual})
     rows = [line.split(" | ") for line in text.splitlines() if line.count(" | ")]
@@ -84,9 +84,11 @@ def test_the_block_has_a_row_for_every_task_and_names_the_best(entered: Any) -> 
     assert [row[:5] for row in rows] == [
         ["pair, mass known", "calm", "learned", "`balance`", "83"],
         *(["pair, mass known", "calm", "classical", name, "83"] for name in ("`copy`", "`lqg`")),
-        ["pair, mass known", "world", "learned", "`balance`", "83"],
-        ["pair, mass known", "world", "classical", "`lqg`", "84"],
-        *(["pair, mass unknown", one, "classical", "`lqg`", "83"] for one in ("calm", "world")),  # flown by no other
+        ["pair, mass known", "disturbed", "learned", "`balance`", "83"],
+        ["pair, mass known", "disturbed", "classical", "`lqg`", "84"],
+        *(
+            ["pair, mass unknown", one, "classical", "`lqg`", "83"] for one in ("calm", "disturbed")
+        ),  # flown by no other
     ]
     assert rows[0][5:] == ["8.0", "2.0", "1.020", "10.0"]
 
@@ -108,7 +110,10 @@ def test_the_chart_shows_the_best_of_the_leaderboard() -> None:
 def test_the_block_says_what_the_first_training_is_worth(
     entered: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    record = {"median": {"policy": 99.6, "calm": 0.625, "world": 0.4}, "rows": [{"seed": 0}, {"seed": 1}, {"seed": 0}]}
+    record = {
+        "median": {"policy": 99.6, "calm": 0.625, "disturbed": 0.4},
+        "rows": [{"seed": 0}, {"seed": 1}, {"seed": 0}],
+    }
     (tmp_path / "first.txt").write_text(json.dumps(record))
     sentence = next(iter(readme.FIRST.values()))
     monkeypatch.setattr(readme, "FIRST", {tmp_path / "first.txt": sentence})

@@ -44,7 +44,7 @@ def modes() -> Iterator[tuple[str, Numbers]]:
 def minutes() -> Iterator[tuple[str, Numbers]]:
     found = [row for row in measured("horizon")["rows"] if row["seconds"] == 600]
     for name, policy, plant in (
-        *((name, name, "paper") for name in ("balance", "sac")),
+        *((name, name, "paper") for name in ("balance", "balance-sac")),
         *((name, "universal", name) for name in ("pair", "team3", "team4", "team6")),
         *((f"ring of {size}", "lost", f"ring of {size}") for size in (3, 6)),
     ):
@@ -60,7 +60,7 @@ def minutes() -> Iterator[tuple[str, Numbers]]:
 def beyond() -> Iterator[tuple[str, Numbers]]:
     found = measured("beyond")["rows"]
     for case in dict.fromkeys(row["case"] for row in found):
-        names = ("lqg-calm", "lqg-world", "sac", "balance", "oracle")
+        names = ("lqg-calm", "lqg-disturbed", "balance-sac", "balance", "oracle")
         *own, oracle = (one(found, case=case, follower=name) for name in names)
         errors = [None if row["error"] is None else 1e3 * row["error"] for row in (*own, oracle)]
         yield case, [*errors[:-1], own[-1]["power"], 100 * own[-1]["rotor_limit_share"], errors[-1]]
@@ -75,20 +75,20 @@ def lost() -> Iterator[tuple[str, Numbers]]:
 
 
 def first() -> Iterator[tuple[str, Numbers]]:
-    columns = {"policy": 1, "command": 1, "calm": 100, "world": 100}
+    columns = {"policy": 1, "command": 1, "calm": 100, "disturbed": 100}
     found, cost = measured("first_command"), {"rotor_power": 1, "rotor_limit_share": 100}
     for row in found["rows"]:
         warm = ", warm" if row["cache"] == "warm" else ""
-        costs = [scale * row[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "world")]
+        costs = [scale * row[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "disturbed")]
         yield f"seed {row['seed']}{warm}", [*(scale * row[name] for name, scale in columns.items()), *costs]
     own = found["again"]
-    costs = [scale * own[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "world")]
-    yield "seed 0, with another noise", [100 * own["calm"], 100 * own["world"], *costs]
+    costs = [scale * own[f"{one} {name}"] for name, scale in cost.items() for one in ("calm", "disturbed")]
+    yield "seed 0, with another noise", [100 * own["calm"], 100 * own["disturbed"], *costs]
     (sac,) = measured("first_command_sac")["rows"]
     yield "--algorithm sac", [scale * sac[name] for name, scale in columns.items()]
-    for name in ("lqg", "lqg-world", "balance"):
+    for name in ("lqg", "lqg-disturbed", "balance"):
         entry = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())
-        counts = [entry["tracks"]["pair"][one] for one in ("calm", "world")]
+        counts = [entry["tracks"]["pair"][one] for one in ("calm", "disturbed")]
         shares = [100 * one["succeeded"] / one["flights"] for one in counts]
         costs = [scale * one[key] for key, scale in cost.items() for one in counts]
         yield f"`{name}`", [*shares, *costs]
@@ -137,10 +137,10 @@ def twin() -> Iterator[tuple[str, Numbers]]:
     found = measured("twin_hover")["rows"]
     learned = {"2.1": "flight", "thrust-upgrade": "flight-upgrade", "brushless": "flight-brushless"}
     for drone, case in dict.fromkeys((row["drone"], row["case"]) for row in found):
-        names = (learned[drone], "universal", "lqg", "lqg-calm", "lqg-world")
+        names = (learned[drone], "universal", "lqg", "lqg-calm", "lqg-disturbed")
         line = case if drone == "2.1" else f"{drone.replace('-', ' ')}, {case}"
         yield line, [1e3 * one(found, drone=drone, case=case, follower=name)["rms"] for name in names]
-    for name in ("flight", "universal", "lqg", "lqg-calm", "lqg-world"):
+    for name in ("flight", "universal", "lqg", "lqg-calm", "lqg-disturbed"):
         own = one(found, drone="2.1", case="as delivered", follower=name)
         numbers = [1e3 * own["largest"], 1e3 * own["sideways"], 1e3 * own["change"], own["touchdown"]]
         yield name, numbers

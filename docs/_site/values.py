@@ -113,7 +113,7 @@ def span(ends: tuple[float, float], factor: float = 1.0) -> str:
 
 @functools.cache
 def oracle_share(track: str) -> str:
-    """calm/world: of the candidates of draw 0 whose load can be trimmed, those that the oracle succeeds in [%]."""
+    """calm/disturbed: of the candidates of draw 0 whose load can be trimmed, those that the oracle succeeds in [%]."""
     shares = []
     for condition in CONDITIONS:
         tried = kept = 0
@@ -130,7 +130,7 @@ def oracle_share(track: str) -> str:
 
 
 def ranked(track: str, follower: str, conditions: Sequence[str] = CONDITIONS) -> str:
-    """calm/world: successes of `follower` on the leaderboard [%]."""
+    """calm/disturbed: successes of `follower` on the leaderboard [%]."""
     entries = importlib.import_module("docs.leaderboard").entries()
     (own,) = (entry["tracks"][track] for entry in entries if entry["follower"] == follower)
     return "/".join(f"{100 * own[one]['succeeded'] / own[one]['flights']:.0f}" for one in conditions)

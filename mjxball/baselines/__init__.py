@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mjxball.baselines.adaptive import Adaptive
-from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, CrazyflieLqg, WorldCrazyflieLqg
+from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, CrazyflieLqg, DisturbedCrazyflieLqg
 from mjxball.baselines.crazyflie_oracle import CrazyflieOracle
-from mjxball.baselines.lqg import CalmLqg, Lqg, WorldLqg
+from mjxball.baselines.lqg import CalmLqg, DisturbedLqg, Lqg
 from mjxball.baselines.mpc import Mpc
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.oracle import Oracle
@@ -30,6 +30,8 @@ __all__ = [
     "Copy",
     "CrazyflieLqg",
     "CrazyflieOracle",
+    "DisturbedCrazyflieLqg",
+    "DisturbedLqg",
     "Lqg",
     "Mpc",
     "Observer",
@@ -37,8 +39,6 @@ __all__ = [
     "Pid",
     "Random",
     "Stay",
-    "WorldCrazyflieLqg",
-    "WorldLqg",
     "make_baseline",
     "make_controller",
 ]
@@ -54,10 +54,10 @@ CONTROLLERS: dict[str, Callable[[Config], Controller]] = {
     "observer": Observer,
     "lqg": lambda config: _of_kind(config, Lqg, CrazyflieLqg),
     "lqg-calm": lambda config: _of_kind(config, CalmLqg, CalmCrazyflieLqg),
-    "lqg-world": lambda config: _of_kind(config, WorldLqg, WorldCrazyflieLqg),
+    "lqg-disturbed": lambda config: _of_kind(config, DisturbedLqg, DisturbedCrazyflieLqg),
     "mpc": Mpc,
 }
-VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-calm", "lqg-world", "mpc")
+VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-calm", "lqg-disturbed", "mpc")
 BASELINES = tuple(name for name in CONTROLLERS if name not in VARIANTS)  # default followers of `eval.py`
 
 

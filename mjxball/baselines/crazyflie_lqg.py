@@ -81,7 +81,7 @@ class Tuning(NamedTuple):
         return Decay(self.load_rate_time, self.load_time, self.lift_time, self.wind_time)
 
 
-# For both conditions of the benchmark, and for one: 44 % of 48 calm flights of the search, 79 % of those in the world,
+# For both conditions of the benchmark, and for one: 44 % of 48 calm flights of the search, 79 % of the disturbed ones,
 # after 1920 sets each.
 BOTH = Tuning()
 CALM = Tuning(
@@ -109,7 +109,7 @@ CALM = Tuning(
     rate_noise=0.0261,
     delay=22.4,
 )
-WORLD = Tuning(
+DISTURBED = Tuning(
     y=0.254,
     vy=0.756,
     height=0.125,
@@ -263,11 +263,11 @@ class CalmCrazyflieLqg(CrazyflieLqg):
     tuning = CALM
 
 
-class WorldCrazyflieLqg(CrazyflieLqg):
-    """`lqg` for flights that are known to be in the world: noise, delay, wind, errors of the plant."""
+class DisturbedCrazyflieLqg(CrazyflieLqg):
+    """`lqg` for flights that are known to be disturbed: noise, delay, wind, errors of the plant."""
 
-    name = "lqg-world"
-    tuning = WORLD
+    name = "lqg-disturbed"
+    tuning = DISTURBED
 
 
 class Actuators:

@@ -32,7 +32,7 @@ from mjxball.baselines.hover_model import (
     hover_model,
 )
 from mjxball.baselines.linear import missed, regulator, riccati, times
-from mjxball.baselines.lqg_tuning import CALM, LONGEST_DELAY, TEAM, TEAM_CALM, TEAM_WORLD, WORLD, Costs, Tuning
+from mjxball.baselines.lqg_tuning import CALM, DISTURBED, LONGEST_DELAY, TEAM, TEAM_CALM, TEAM_DISTURBED, Costs, Tuning
 from mjxball.baselines.sharing import Assumed, Wanted, level, sharing
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
@@ -254,8 +254,8 @@ class CalmLqg(Lqg):
     tuning, team_tuning = CALM, TEAM_CALM
 
 
-class WorldLqg(Lqg):
-    """`lqg` for flights that are known to be in the world: noise, delay, wind, errors of the plant."""
+class DisturbedLqg(Lqg):
+    """`lqg` for flights that are known to be disturbed: noise, delay, wind, errors of the plant."""
 
-    name = "lqg-world"
-    tuning, team_tuning = WORLD, TEAM_WORLD
+    name = "lqg-disturbed"
+    tuning, team_tuning = DISTURBED, TEAM_DISTURBED

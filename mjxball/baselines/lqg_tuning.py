@@ -1,11 +1,12 @@
 """Parameters of `lqg`, found by `benchmarks/tuning.py` on flights of a draw that no table reports.
 
 Costs of that script, 1 if every flight succeeds as early as with `oracle` and 5 if none does, and successes, of 72
-flights of the pair in each condition, after 3840 sets: 2.40 of the defaults in both conditions (93 % calm, 18 % in
-the world), 1.03 of `CALM` (97 %, calm), 2.60 of `WORLD` (42 %, in the world). Of 108 flights of nine teams and random
-rigs in each condition, after 1200 sets: 2.76 of `TEAM` (56 and 29 %), 1.68 of `TEAM_CALM` (62 %), 3.12 of `TEAM_WORLD`
-(38 %). All but `WORLD` are of searches without the knowledge of repeated measurements; with it the defaults' search
-found 2.20, which succeeds in 73 instead of 86 % of the calm flights with unknown mass, and was not kept.
+flights of the pair in each condition, after 3840 sets: 2.40 of the defaults in both conditions (93 % calm, 18 %
+disturbed), 1.03 of `CALM` (97 %, calm), 2.60 of `DISTURBED` (42 %, disturbed). Of 108 flights of nine teams and random
+rigs in each condition, after 1200 sets: 2.76 of `TEAM` (56 and 29 %), 1.68 of `TEAM_CALM` (62 %), 3.12 of
+`TEAM_DISTURBED` (38 %). All but `DISTURBED` are of searches without the knowledge of repeated measurements; with it the
+defaults' search found 2.20, which succeeds in 73 instead of 86 % of the calm flights with unknown mass, and was not
+kept.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ CALM = Tuning(
     loop_scale=1,
     delay=0.185,
 )
-WORLD = Tuning(
+DISTURBED = Tuning(
     position=0.0471,
     velocity=0.188,
     height=0.0277,
@@ -174,7 +175,7 @@ TEAM_CALM = Tuning(
     loop_scale=1.03,
     delay=0.757,
 )
-TEAM_WORLD = Tuning(
+TEAM_DISTURBED = Tuning(
     position=0.00943,
     velocity=0.218,
     height=0.0174,

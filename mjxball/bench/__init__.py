@@ -7,4 +7,4 @@ criterion of a version never change.
 """
 
 NAME, VERSION = "mjxball-bench", 2
-CONDITIONS = ("calm", "world")
+CONDITIONS = ("calm", "disturbed")

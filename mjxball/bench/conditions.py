@@ -1,4 +1,4 @@
-"""The two conditions of a flight: calm, with constant errors of the sensors alone, and the world that drones fly in.
+"""The two conditions of a flight: calm, with constant errors of the sensors alone, and disturbed, as drones fly.
 
 Levels come from public flights with motion capture (`benchmarks/sensor_levels.py`) and from published figures.
 """
@@ -50,8 +50,8 @@ def in_calm(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, disturbance=Disturbance(offset=OFFSET))
 
 
-def in_world(scenario: Scenario, config: Config, random: np.random.Generator, air: Air = OUTDOORS) -> Scenario:
-    """`scenario` in the world: sensors, air, attitude loops and thrusts sampled for the flight.
+def with_disturbances(scenario: Scenario, config: Config, random: np.random.Generator, air: Air = OUTDOORS) -> Scenario:
+    """`scenario` as drones fly: sensors, air, attitude loops and thrusts sampled for the flight.
 
     `scenario.thrust`, if given, stays; attitude loops stay those of `config` where `air.loops` is 0.
     """

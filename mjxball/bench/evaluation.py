@@ -26,6 +26,8 @@ from mjxball.sim.rollout import load_of
 from mjxball.sim.scenario import Scenario
 
 KEY = re.compile(r"[0-9a-f]{32}")
+# What version 2 makes seeds of: conditions had these names when it was published.
+SEEDED_AS = {"calm": "calm", "disturbed": "world"}
 
 
 class Result(NamedTuple):
@@ -98,6 +100,6 @@ def _fly(groups: dict[int, Group], key: str, process: FollowerProcess) -> list[R
 
 def with_seed(flight: Flight, key: str, plant: int) -> Scenario:
     """The scenario of a flight on a track's plant number `plant`, with noise from `key` and the track's name."""
-    seed = seed_of(key, plant, flight.condition, flight.candidate)
+    seed = seed_of(key, plant, SEEDED_AS[flight.condition], flight.candidate)
     disturbance = dataclasses.replace(flight.scenario.disturbance, seed=seed)
     return dataclasses.replace(flight.scenario, disturbance=disturbance)

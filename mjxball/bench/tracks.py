@@ -1,7 +1,7 @@
 """The tracks of mjxball-bench: plants, and how flights on them are sampled.
 
 A draw is the seed of all flights. The leaderboard uses draw 0; other draws are flights that nobody tuned to. The
-conditions have different flights, so that no follower can recognise a calm flight in the world.
+conditions have different flights, so that no follower can recognise a calm flight.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from mjxball.bench import CONDITIONS, VERSION
-from mjxball.bench.conditions import CRAZYFLIE, OUTDOORS, RIGS_AIR, Air, in_calm, in_world
+from mjxball.bench.conditions import CRAZYFLIE, OUTDOORS, RIGS_AIR, Air, in_calm, with_disturbances
 from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.constants import trim_limit
 from mjxball.plant.teams import ring_config
@@ -26,7 +26,7 @@ from mjxball.sim.scenario import CgPath, Scenario
 SECONDS = 30.0  # of a flight
 FLIGHTS = 120  # of a track in each condition
 RADIUS, CRAZYFLIE_RADIUS, MOVING_RADIUS = 0.010, 0.020, 0.020  # about the goal, calm [m]
-WORLD_RADIUS = 2.0  # radius in the condition world over that in calm
+DISTURBED_RADIUS = 2.0  # radius of disturbed flights over that of calm ones
 RIG_LENGTH = 0.17  # length of a rig up to which the radius is as above [m]
 MARGIN = 0.15  # trim margin of every load, see `plant.trim`
 SPEEDS = (0.2, 3.1)  # of the CG [rad/s]
@@ -58,7 +58,7 @@ class PlantFlights:
 
     def radius_in(self, condition: str) -> float:
         """Radius [m] about the goal within which a flight in `condition` must stay."""
-        return self.radius * (WORLD_RADIUS if condition == "world" else 1.0)
+        return self.radius * (DISTURBED_RADIUS if condition == "disturbed" else 1.0)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _goal(random: np.random.Generator, distance: float = 1.0) -> tuple[float, fl
 def _as_in(
     condition: str, scenario: Scenario, config: Config, random: np.random.Generator, air: Air = OUTDOORS
 ) -> Scenario:
-    return in_world(scenario, config, random, air) if condition == "world" else in_calm(scenario)
+    return with_disturbances(scenario, config, random, air) if condition == "disturbed" else in_calm(scenario)
 
 
 def _pair(draw: int, known: bool) -> list[PlantFlights]:

@@ -66,7 +66,7 @@ class Watch:
                 continue
             self.points.append(Point(seconds, success))
             others = "; ".join(f"{name} {_percent(one)}" for name, one in self.known.items())
-            self._say(f"success after {seconds:.0f} s: {_percent(success)} % calm/world ({others})")
+            self._say(f"success after {seconds:.0f} s: {_percent(success)} % calm/disturbed ({others})")
 
 
 def _percent(success: Success) -> str:

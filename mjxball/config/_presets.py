@@ -107,8 +107,8 @@ RECURRENT_GRADIENT = Gradient(
 RECURRENT = Follower(previous_action=True, recurrent_units=64)
 
 
-# The world of mjxball-bench; delays beyond its range, so that its own are no ends.
-WORLD: dict[str, Any] = {
+# Disturbed flights of mjxball-bench; delays beyond its range, so that its own are no ends.
+DISTURBED: dict[str, Any] = {
     "noise": (0.5, 2.0),
     "estimator_drift": (0.5, 1.5),
     "offset": (1.0, 1.0),
@@ -143,7 +143,7 @@ def _balance() -> Config:
         ),
         scenario=replace(
             large.scenario,
-            **WORLD,
+            **DISTURBED,
             # Faster loads than documented, and loads beyond what one drone trims, as a margin.
             cg_speed=(0.2, 3.5),
             trim_margin=-0.15,
@@ -193,7 +193,7 @@ def _balance() -> Config:
 
 
 def _quick() -> Config:
-    """A first follower in two minutes on two cores: the pair in the world, nominal but for sensors, air and mass."""
+    """A first follower in two minutes on two cores: a disturbed pair, nominal but for sensors, air and mass."""
     balance = _balance()
     return replace(
         balance,
@@ -263,7 +263,7 @@ def _team() -> Config:
 
 
 def _universal() -> Config:
-    """One follower for teams of any drones and loads in the world, which knows only where drones are mounted."""
+    """One follower for disturbed teams of any drones and loads, which knows only where drones are mounted."""
     large = _large()
     team = apply_overrides(large, read_plant("team6").settings)
     return replace(
@@ -276,7 +276,7 @@ def _universal() -> Config:
         follower=replace(RECURRENT, recurrent_units=96, stale=True, action_scale_tilt=0.6, action_scale_vertical=8.0),
         scenario=replace(
             large.scenario,
-            **WORLD,
+            **DISTURBED,
             team_sizes=(2, 3, 4, 5, 6),
             cg_speed=(0.1, 4.0),
             cg_amplitude=(0.0, 0.2),
@@ -306,7 +306,7 @@ def _universal() -> Config:
 
 
 def _lost() -> Config:
-    """One follower for rings of three to six drones in the world, of which any one may stop."""
+    """One follower for disturbed rings of three to six drones, of which any one may stop."""
     universal = _universal()
     return replace(
         universal,

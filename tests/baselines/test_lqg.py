@@ -9,9 +9,9 @@ import pytest
 from tables import rows
 
 from mjxball.baselines import make_baseline, make_controller
-from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, CrazyflieLqg, WorldCrazyflieLqg
+from mjxball.baselines.crazyflie_lqg import CalmCrazyflieLqg, CrazyflieLqg, DisturbedCrazyflieLqg
 from mjxball.baselines.hover_model import ERRORS, LIFT_ERROR, LOAD, MEASURED, RATES, STATES, WIND
-from mjxball.baselines.lqg import MEMORY, CalmLqg, Lqg, WorldLqg, apart, noises
+from mjxball.baselines.lqg import MEMORY, CalmLqg, DisturbedLqg, Lqg, apart, noises
 from mjxball.baselines.lqg_tuning import LONGEST_DELAY, Tuning
 from mjxball.config import Config, preset, with_plant
 from mjxball.control.followers import PrivilegedInfo
@@ -153,10 +153,10 @@ def test_it_knows_no_more_than_the_believed_mass() -> None:
     "kind, plant, attribute",
     [
         (CalmLqg, PAPER, "tuning"),
-        (WorldLqg, preset("team"), "team_tuning"),
-        (WorldLqg, preset("universal"), "team_tuning"),
+        (DisturbedLqg, preset("team"), "team_tuning"),
+        (DisturbedLqg, preset("universal"), "team_tuning"),
         (CalmCrazyflieLqg, preset("flight"), "tuning"),
-        (WorldCrazyflieLqg, preset("flight"), "tuning"),
+        (DisturbedCrazyflieLqg, preset("flight"), "tuning"),
     ],
 )
 def test_a_variant_has_the_tuning_for_its_condition(kind, plant, attribute, monkeypatch) -> None:

@@ -20,7 +20,10 @@ def known(calm: Any = None, **changed: Any) -> dict[str, Any]:
     found = {
         **{"benchmark": "mjxball-bench", "version": 2, "draw": 0, "key": "0123456789abcdef" * 2},
         **{"follower": "mine", "sha256": "ab" * 32, "date": datetime.datetime.now(datetime.UTC).date().isoformat()},
-        **{"cpu_time": 1e-3, "tracks": {"pair": {"calm": calm or results(), "world": results(late_error_90=0.018)}}},
+        **{
+            "cpu_time": 1e-3,
+            "tracks": {"pair": {"calm": calm or results(), "disturbed": results(late_error_90=0.018)}},
+        },
         **{"not_flown": {"team": "it is for pairs"}, "command": "python eval.py bench mine.npz --out mine.json"},
         **{"commit": "93771579971e", "versions": {"python": "3.11.7"}},
     }

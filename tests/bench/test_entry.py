@@ -63,7 +63,7 @@ HEADS: list[tuple[str, dict[str, Any]]] = [
     ("was flown and not flown", {"not_flown": {"pair": "but it was"}}),
     ("has no track", {"tracks": {}}),
     ("has a track 'moon'", {"tracks": {**known()["tracks"], "moon": {}}}),
-    ("lacks results of track pair in calm and world", {"tracks": {"pair": {"calm": results()}}}),
+    ("lacks results of track pair in calm and disturbed", {"tracks": {"pair": {"calm": results()}}}),
     ("lacks results of track pair", {"tracks": {"pair": [results(), results()]}}),
 ]
 RESULTS: list[tuple[str, Any]] = [

@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.baselines import make_baseline
 from mjxball.bench import flying
-from mjxball.bench.conditions import CRAZYFLIE, OFFSET, OUTDOORS, in_calm, in_world
+from mjxball.bench.conditions import CRAZYFLIE, OFFSET, OUTDOORS, in_calm, with_disturbances
 from mjxball.bench.draw import with_perfect_sensors
 from mjxball.bench.tracks import TRACKS
 from mjxball.config import Config, preset
@@ -34,7 +34,7 @@ def test_plants_fly_together_as_each_does_alone() -> None:
     plants = [one for one in TRACKS["rigs"].flights(5) if one.config.plant.count == 3][:3]
     parts = []
     for number, plant in enumerate(plants):
-        scenarios = [plant.sample(np.random.default_rng([number, k]), "world") for k in range(2)]
+        scenarios = [plant.sample(np.random.default_rng([number, k]), "disturbed") for k in range(2)]
         short = [dataclasses.replace(one, seconds=4.0) for one in scenarios]
         follower = Observing(plant.config)
         parts.append(flying.Part(plant.config, follower, short, np.full(2, 0.02), np.full(2, 2.0)))
@@ -63,7 +63,7 @@ def test_a_calm_flight_has_constant_errors_alone() -> None:
 def test_the_world_is_sampled_within_its_levels() -> None:
     config = preset("paper")
     random = np.random.default_rng(0)
-    flown = [in_world(Scenario(goal=(0.0, 0.0, -0.5)), config, random) for _ in range(2000)]
+    flown = [with_disturbances(Scenario(goal=(0.0, 0.0, -0.5)), config, random) for _ in range(2000)]
     levels = {
         "drag": [one.rotor_drag for one in flown],
         "wind": [float(np.hypot(*one.wind[:2])) for one in flown],
@@ -79,6 +79,6 @@ def test_the_world_is_sampled_within_its_levels() -> None:
     assert {round(one.disturbance.delay / 0.02) for one in flown} == {0, 1, 2, 3}
     assert len(levels["clearance"]) == pytest.approx(1000, abs=90)  # four deviations
     assert len({one.disturbance.gust_seed for one in flown}) > 1990
-    small = in_world(Scenario(goal=(0.0, 0.0, 0.1)), preset("flight"), random, CRAZYFLIE)
+    small = with_disturbances(Scenario(goal=(0.0, 0.0, 0.1)), preset("flight"), random, CRAZYFLIE)
     assert small.loop_scale == 1.0
     assert small.disturbance.quantize

@@ -30,13 +30,13 @@ def made(tmp_path: Path) -> Any:
 
 def test_rows_are_entries_and_the_most_successful_in_the_world_stands_first(tmp_path: Path, made: Any) -> None:
     tracks = known()["tracks"]
-    better = {"pair": {**tracks["pair"], "world": {**reasons(rotors=9), "succeeded": 101, "late_error_90": 0.018}}}
+    better = {"pair": {**tracks["pair"], "disturbed": {**reasons(rotors=9), "succeeded": 101, "late_error_90": 0.018}}}
     (tmp_path / "a.json").write_text(json.dumps(known(follower="worse")))
     (tmp_path / "b.json").write_text(json.dumps(known(follower="better", tracks=better)))
     head, line, *lines = made.pair().splitlines()
     assert head.count("|") == line.count("|") == lines[0].count("|") == len(HEADS) + 4
     assert [row.split("|")[1].strip() for row in lines] == ["`better`", "", "`worse`", ""]
-    assert [row.split("|")[2].strip() for row in lines] == ["calm", "world"] * 2
+    assert [row.split("|")[2].strip() for row in lines] == ["calm", "disturbed"] * 2
     assert len(made.team().splitlines()) == 2
     assert all(callable(getattr(made, track.replace("-", "_"))) for track in TRACKS)
 

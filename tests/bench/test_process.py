@@ -276,7 +276,7 @@ def test_noise_and_order_come_from_the_key_alone(own: Path) -> None:
     """The same key gives the same bits, a fresh one other noise; no flight has the seed of its draw."""
     again, same, other = (flown("own:Copies", key=key) for key in (KEY, KEY, fresh_key()))
     np.testing.assert_array_equal(values(again), values(same))
-    for condition in ("calm", "world"):
+    for condition in ("calm", "disturbed"):
         mine, others = (values([one for one in found if one.flight.condition == condition]) for found in (same, other))
         assert np.abs(mine - others).max() > 1e-6  # calm flights have constant errors of the key
     flights = [one.flight for one in same]

@@ -23,7 +23,7 @@ def test_the_few_flights_are_not_those_that_are_ranked() -> None:
     for track in QUICK_TRACKS:
         few, (ranked,) = quick_group(track), groups_of(track, 0)
         assert few.config == ranked.config
-        assert [one.condition for one in few.flights] == ["calm"] * QUICK_FLIGHTS + ["world"] * QUICK_FLIGHTS
+        assert [one.condition for one in few.flights] == ["calm"] * QUICK_FLIGHTS + ["disturbed"] * QUICK_FLIGHTS
         goals = {one.scenario.goal for one in ranked.flights}
         assert not goals.intersection(one.scenario.goal for one in few.flights)
 
@@ -38,10 +38,10 @@ def test_followers_flown_together_succeed_as_each_alone() -> None:
     config = quick_group("pair").config
     names = ("copy", "lqg-calm", "lqg")
     together = quick_success("pair", [make_baseline(name, config) for name in names])
-    assert together[0] == {"calm": 0.0, "world": 0.0}
+    assert together[0] == {"calm": 0.0, "disturbed": 0.0}
     assert quick_success("pair", [make_baseline("lqg", config)]) == together[2:]
     assert together[2]["calm"] > 0.85  # 95 % of the flights that are ranked
-    assert together[2]["world"] < 0.5
+    assert together[2]["disturbed"] < 0.5
 
 
 def test_known_followers_are_stored_and_flown_only_if_they_changed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,7 +49,7 @@ def test_known_followers_are_stored_and_flown_only_if_they_changed(monkeypatch: 
     monkeypatch.setattr(quick, "fly_known", lambda track: {"flown": {"calm": 1.0}})
     for track in QUICK_TRACKS:
         assert list(known_success(track)) == list(KNOWN[track])
-    for others in (("lqg", "sac"), ("lqg-world", "balance")):
+    for others in (("lqg", "balance-sac"), ("lqg-disturbed", "balance")):
         monkeypatch.setitem(KNOWN, "pair", others)
         assert known_success("pair") == {"flown": {"calm": 1.0}}
 
@@ -65,7 +65,7 @@ def test_known_followers_succeed_as_stored() -> None:
 
 def test_a_watch_says_the_newest_and_writes_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, go, flown = threading.Event(), threading.Event(), list[list[str]]()
-    known = {"lqg": {"calm": 0.5, "world": 0.25}, "balance": {"calm": 0.6, "world": 0.25}}
+    known = {"lqg": {"calm": 0.5, "disturbed": 0.25}, "balance": {"calm": 0.6, "disturbed": 0.25}}
 
     def known_of(track: str) -> dict[str, dict[str, float]]:
         begun.set()
@@ -74,7 +74,7 @@ def test_a_watch_says_the_newest_and_writes_all(tmp_path: Path, monkeypatch: pyt
 
     def success(track: str, followers: Any) -> list[dict[str, float]]:
         flown.append([one.name for one in followers])
-        return [{"calm": 0.5, "world": 0.25}]
+        return [{"calm": 0.5, "disturbed": 0.25}]
 
     monkeypatch.setattr(watch, "known_success", known_of)
     monkeypatch.setattr(watch, "quick_success", success)
@@ -82,13 +82,13 @@ def test_a_watch_says_the_newest_and_writes_all(tmp_path: Path, monkeypatch: pyt
     watched = Watch("pair", 0.0, said.append)
     watched.start()
     assert begun.wait(20)
-    for name in ("sac", "paper", "balance"):  # while it is busy; only the last is still of interest
+    for name in ("balance-sac", "paper", "balance"):  # while it is busy; only the last is still of interest
         watched(shipped_policy(name))
     go.set()
     watched.end()
     assert flown == [["balance"]]
     (line,) = said
-    assert "50/25 % calm/world (lqg 50/25; balance 60/25)" in line
+    assert "50/25 % calm/disturbed (lqg 50/25; balance 60/25)" in line
     table = write(watched, tmp_path / "eval").splitlines()
     assert [row.split() for row in table[1:]] == [
         ["this", "policy", "50", "25"],
@@ -96,5 +96,5 @@ def test_a_watch_says_the_newest_and_writes_all(tmp_path: Path, monkeypatch: pyt
         ["balance", "60", "25"],
     ]
     record = json.loads((tmp_path / "eval" / "success.json").read_text())
-    assert [sorted(one) for one in record["points"]] == [["calm", "seconds", "world"]]
+    assert [sorted(one) for one in record["points"]] == [["calm", "disturbed", "seconds"]]
     assert (tmp_path / "eval" / "success.png").stat().st_size > 5000

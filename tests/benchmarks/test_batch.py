@@ -42,7 +42,7 @@ SCENARIOS = [
     "name",
     [
         "copy",
-        pytest.param("sac", marks=pytest.mark.slow),  # `balance` circles, and float32 comes to circle elsewhere
+        pytest.param("balance-sac", marks=pytest.mark.slow),  # `balance` circles, and float32 comes to circle elsewhere
         *weekly("adaptive-mass", "lqg", "oracle"),
     ],
 )

@@ -25,7 +25,7 @@ def part() -> tuning.Part:
 @pytest.mark.slow
 def test_the_compiled_program_of_oracle_arrives_when_the_benchmark_says_so(part) -> None:
     """To a control step: the program is in float32."""
-    assert part.conditions.tolist() == ["calm"] * 2 + ["world"] * 2
+    assert part.conditions.tolist() == ["calm"] * 2 + ["disturbed"] * 2
     arrays = tuning.TUNED["oracle"].arrays(part.config, Oracle.tuning)
     flown = tuning.Flown("oracle", part.of_oracle(1.0))(jax.tree.map(lambda leaf: np.asarray(leaf)[None], arrays))
     np.testing.assert_allclose(flown.time[0], part.known, atol=1.01 * part.config.timing.control_period)

@@ -91,7 +91,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of three followers in four scenarios, through the command line."""
     out = tmp_path_factory.mktemp("flown") / "report"
     flags = [
-        "policies/archive/transport.npz",
+        "policies/archive/transport-large.npz",
         "--followers",
         "copy",
         "adaptive",
@@ -111,7 +111,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_the_report_says_how_it_was_made(written: Path) -> None:
     text = (written / "report.html").read_text()
-    assert "python eval.py policies/archive/transport.npz --followers copy adaptive" in text
+    assert "python eval.py policies/archive/transport-large.npz --followers copy adaptive" in text
     assert "metadata of <b>transport</b>" in text
     assert "image/webp;base64" in text or "No picture: MuJoCo" in text
     assert len(json.loads((written / "cells.json").read_text())["cells"]) == 4 * 3
@@ -145,7 +145,7 @@ def test_the_report_sorts_and_filters(browser: Any, written: Path) -> None:
     tab.click("#table th:nth-child(8) button")
     assert column() == sorted(column(), reverse=True)
     assert len(column()) == 15
-    tab.select_option("#follower", "transport")
+    tab.select_option("#follower", "transport-large")
     assert len(column()) == 5
     tab.select_option("#scenario", "median of 4")
     assert len(column()) == 1

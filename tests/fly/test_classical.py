@@ -83,7 +83,7 @@ def test_a_file_of_that_name_is_a_policy(tmp_path: Path, monkeypatch: pytest.Mon
         (["lqg", "--rehearse", "--plant", "pair"], "--plant pair is no pair of Crazyflies"),
         (["lqg", "--rehearse", "--plant", "nowhere.toml"], "nowhere.toml"),
         (["lqg", "--rehearse", "--onboard"], "--onboard runs a network in C, and lqg is none"),
-        (["flight", "--rehearse", "--plant", "crazyflie"], "--plant is for lqg, lqg-calm, lqg-world"),
+        (["flight", "--rehearse", "--plant", "crazyflie"], "--plant is for lqg, lqg-calm, lqg-disturbed"),
     ],
 )
 def test_what_is_refused(line: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,7 +120,7 @@ def test_flags_overrule_the_card() -> None:
 
 
 def test_policies_of_other_plants_keep_their_defaults() -> None:
-    contents = load_file(shipped_policy("transport"))
+    contents = load_file(shipped_policy("transport-large"))
     config = policy_setup.config_of(contents.metadata)
     assert not policy_setup.is_crazyflie(config)
     assert policy_setup.gains_of(config) == ({}, {})

@@ -81,7 +81,7 @@ def limited(remembering: Trained) -> PolicyFile:
 @pytest.fixture(
     params=[
         *("trained", "direct", "remembering", "limited", "recurrent"),
-        *("balance", "transport", "robust", "flight", "stand", "paper"),
+        *("balance", "transport-large", "robust", "flight", "stand", "paper"),
         *("universal pair", "universal team3"),
     ]
 )
@@ -89,7 +89,7 @@ def contents(request: pytest.FixtureRequest) -> PolicyFile:
     name, _, plant = request.param.partition(" ")
     if plant:
         return in_team(load_file(shipped_policy(name)), name, Path(plant), None if plant == "pair" else 2)
-    if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
+    if name in ("balance", "transport-large", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(name))
     made = request.getfixturevalue(request.param)
     return made if isinstance(made, PolicyFile) else made.contents

@@ -81,7 +81,7 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str):
             np.testing.assert_array_equal(found["next_memory"][2::2, row], found["next_memory"][1:-1:2, row])
 
 
-@rows("name", ("recurrent", "paper", "flight", "sac", "universal"))  # none of which observes it
+@rows("name", ("recurrent", "paper", "flight", "balance-sac", "universal"))  # none of which observes it
 def test_a_repeated_measurement_is_noticed_as_by_policy(name: str, recurrent: Recurrent):
     """Each row by itself: of two flights one has repeats, and an observation that cannot be before each."""
     plain = recurrent.contents if name == "recurrent" else contents_of(name)

@@ -352,4 +352,10 @@ def test_any_bytes_are_refused(content: bytes, head: bytes, tmp_path: Path) -> N
 
 def test_shipped_policies_load() -> None:
     assert {"paper", "balance", "flight"} <= {Policy.load(path).name for path in shipped_policies()}
-    assert {shipped_policy(name).parent.name for name in ("transport", "robust")} == {"archive"}
+    assert {shipped_policy(name).parent.name for name in ("transport-large", "robust")} == {"archive"}
+
+
+def test_a_shipped_policy_has_the_name_of_its_preset_and_then_what_differs_from_it() -> None:
+    for path in shipped_policies():
+        preset = Policy.load(path).metadata["preset"]
+        assert path.stem == preset or path.stem.startswith(f"{preset}-"), path.stem

@@ -284,7 +284,7 @@ def test_what_nobody_measured_is_not_shown(flight: Flight, browser: Any, tmp_pat
     tab.close()
 
 
-@pytest.mark.parametrize(("name", "plant", "units"), [("sac", None, (48,)), ("universal", "team3", (2, 96))])
+@pytest.mark.parametrize(("name", "plant", "units"), [("balance-sac", None, (48,)), ("universal", "team3", (2, 96))])
 def test_what_a_recurrent_network_remembers_is_shown_if_asked(
     name: str, plant: str | None, units: tuple[int, ...], browser: Any, tmp_path: Path
 ):

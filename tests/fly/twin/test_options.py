@@ -77,10 +77,10 @@ def test_kinds_differ_in_what_they_say() -> None:
 @rows(
     "policy, flags, sentence",
     [
-        ("transport", "--fault weak:leader@1", "--fault weak:leader@1 is for policies that were trained on"),
-        ("transport", "--fault pose-lost:follower@1", "pose-lost:follower@1 is for policies"),
-        ("transport", "--twin-noise 2", "--twin-noise is for policies that were trained on Crazyflies"),
-        ("transport", "--twin-gains 1 0.9", "--twin-gains is for policies that were trained on Crazyflies"),
+        ("transport-large", "--fault weak:leader@1", "--fault weak:leader@1 is for policies that were trained on"),
+        ("transport-large", "--fault pose-lost:follower@1", "pose-lost:follower@1 is for policies"),
+        ("transport-large", "--twin-noise 2", "--twin-noise is for policies that were trained on Crazyflies"),
+        ("transport-large", "--twin-gains 1 0.9", "--twin-gains is for policies that were trained on Crazyflies"),
         ("flight", "--fault peer:leader@1", "--fault peer:leader@1 is for --onboard"),
         ("flight", "--fault pose-jump:leader@1 --twin-deck no", "is of the deck's poses"),
     ],
