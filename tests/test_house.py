@@ -9,6 +9,7 @@ import yaml
 from command_line import REPOSITORY
 from tables import rows
 
+PYTHONS = ["3.11", "3.12", "3.13", "3.14"]
 DOCUMENTS = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
 
 
@@ -22,11 +23,22 @@ def test_hooks_are_local() -> None:
 def test_the_workflow_runs_ci_on_every_supported_python_and_on_the_lowest_versions() -> None:
     jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     whole, lowest = jobs["test"], jobs["lowest"]
-    assert whole["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13"]
+    assert whole["strategy"]["matrix"]["python"] == PYTHONS
     assert whole["steps"][-1]["run"] == ".ci/run"
     *_, install, tests = (step.get("run", "") for step in lowest["steps"])
     assert "--resolution lowest-direct -e '.[dev,fly]'" in install
     assert tests == "python -m pytest -n 2 --dist loadfile"
+
+
+def test_packages_are_installed_every_week_with_the_lowest_and_highest_versions() -> None:
+    job = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "weekly.yml").read_text())["jobs"]["install"]
+    assert job["strategy"]["matrix"] == {"python": PYTHONS, "versions": ["highest", "lowest-direct"]}
+    assert job["steps"][-1]["run"] == ".ci/release python3 ${{ matrix.versions }}"
+    script = (REPOSITORY / ".ci" / "release").read_text()
+    (wanted,) = re.findall(r"/\^(python )/", script)
+    readme = (REPOSITORY / "README.md").read_text()
+    typed = [line for block in re.findall(r"```bash\n(.*?)```", readme, flags=re.S) for line in block.splitlines()]
+    assert sum(line.startswith(wanted) for line in typed) >= 3  # to train, to compare, to watch
 
 
 def test_what_ci_leaves_out_runs_every_week() -> None:
@@ -44,7 +56,7 @@ def test_what_ci_leaves_out_runs_every_week() -> None:
 def test_a_release_gets_files_that_were_tried_and_signed() -> None:
     text = (REPOSITORY / ".github" / "workflows" / "release.yml").read_text()
     workflow = yaml.safe_load(text)
-    (job,) = workflow["jobs"].values()
+    job, upload = workflow["jobs"]["attach"], workflow["jobs"]["pypi"]
     assert workflow["permissions"] == {"contents": "read"}
     assert job["permissions"] == {"contents": "write", "id-token": "write", "attestations": "write"}
     steps = [step.get("run") or step["uses"] for step in job["steps"]]
@@ -52,6 +64,8 @@ def test_a_release_gets_files_that_were_tried_and_signed() -> None:
     places = [next(place for place, step in enumerate(steps) if word in step) for word in order]
     assert places == sorted(places)
     assert not any("${{" in step for step in steps)  # a tag's name would be run
+    assert (upload["needs"], upload["if"], upload["environment"]) == ("attach", "vars.PYPI == 'yes'", "pypi")
+    assert upload["permissions"] == {"id-token": "write"}
 
 
 def test_ci_checks_style_and_types() -> None:
