@@ -15,7 +15,7 @@ from pathlib import Path
 from mjxball import cli, terminal
 from mjxball.control.crazyflie import PairGains
 from mjxball.errors import InputError
-from mjxball.policy import policy_path
+from mjxball.policy import policy_name, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.running import run_command
 from mjxfly import app_flight, clock, limits
@@ -298,7 +298,7 @@ def on_board(
         raise InputError(f"--onboard runs a network in C, and {options.policy} is none: name a policy")
     if options.thrust or options.hover or options.mass:
         raise InputError("--onboard flies the thrust map in the app: leave --thrust, --hover and --mass out")
-    policy, name = load_policy(options.policy), options.policy.stem
+    policy, name = load_policy(options.policy), policy_name(options.policy)
     generate.check_policy(policy, name)
     idents = [generate.weights_crc(policy, int8) for int8 in (False, True)]
     weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None

@@ -14,7 +14,7 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.errors import InputError
-from mjxball.policy import Policy, PolicyFile, load_file, team
+from mjxball.policy import Policy, PolicyFile, load_file, policy_name, team
 from mjxfly.classical import NAMES as CLASSICAL
 from mjxfly.classical import ClassicalFollower, classical, is_classical
 from mjxfly.limits import Limits, Times
@@ -32,7 +32,7 @@ def load_policy(path: Path) -> PolicyFile:
     contents = load_file(path)
     if not team.is_for_any(contents.metadata):
         return contents
-    return team.in_team(contents, path.stem, plant_setup(team.CRAZYFLIES))
+    return team.in_team(contents, policy_name(path), plant_setup(team.CRAZYFLIES))
 
 
 def load_follower(path: Path, plant: Path | None = None) -> Policy | ClassicalFollower:
@@ -41,7 +41,7 @@ def load_follower(path: Path, plant: Path | None = None) -> Policy | ClassicalFo
         return classical(str(path), plant)
     if plant is not None:
         raise InputError(f"--plant is for {', '.join(CLASSICAL)}: a policy flies the plant in its metadata")
-    return Policy(load_policy(path), path.stem)
+    return Policy(load_policy(path), policy_name(path))
 
 
 def config_of(metadata: Mapping[str, Any]) -> Config:

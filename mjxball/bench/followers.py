@@ -17,7 +17,7 @@ from mjxball.errors import InputError, said
 from mjxball.evaluate.followers import FollowerFactory, answered, follower_factory
 from mjxball.evaluate.policies import load_policy
 from mjxball.files import read_bytes
-from mjxball.policy import Policy, policy_path, shipped_policies
+from mjxball.policy import Policy, policy_name, policy_path, shipped_policies
 from mjxball.policy.file import residual_on_pid
 from mjxball.reading import parse_json
 
@@ -34,7 +34,7 @@ def entrant(text: str) -> tuple[str, FollowerFactory]:
     path = policy_path(text)
     if path.suffix == ".npz":
         Policy.load(path)  # raises at once for a bad file
-        return path.stem, lambda config: _loaded(path, config)
+        return policy_name(path), lambda config: _loaded(path, config)
     if path.suffix == ".onnx":
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
@@ -49,7 +49,7 @@ def identity(text: str) -> tuple[str, str]:
     """
     path = policy_path(text)
     if path.suffix in (".npz", ".onnx"):
-        return path.stem, hashlib.sha256(read_bytes(path, "", 2**30)).hexdigest()
+        return policy_name(path), hashlib.sha256(read_bytes(path, "", 2**30)).hexdigest()
     check_name(text)
     sources = sorted(BASELINES.glob("*.py")) if text in CONTROLLERS else [_source(text)]
     content = b"".join(read_bytes(source) for source in sources)

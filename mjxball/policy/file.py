@@ -372,6 +372,12 @@ def policy_path(text: str | os.PathLike[str]) -> Path:
     return path if os.path.lexists(path) else _shipped().get(str(text), path)
 
 
+def policy_name(path: str | os.PathLike[str]) -> str:
+    """What the policy in the file `path` is called: its run, for the `policy.npz` of a run directory, else the stem."""
+    path = Path(path)
+    return path.absolute().parent.name if path.name == "policy.npz" else path.stem
+
+
 def _shipped() -> dict[str, Path]:
     return {path.stem: path for path in (*shipped_policies(), *sorted((_folder() / ARCHIVE).glob("*.npz")))}
 

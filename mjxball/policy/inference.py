@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
 from mjxball.control.network_interface import NetworkInterface
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, interface_of, load_file, residual_on_pid
+from mjxball.policy.file import PolicyFile, interface_of, load_file, policy_name, residual_on_pid
 
 ROUNDED = 1e-5  # tolerance for a GRU's state beyond 1, from rounding
 
@@ -106,7 +105,7 @@ class Policy:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
         """Load a policy file. Raises PolicyFileError, with one sentence, if it is invalid."""
-        return cls(load_file(path), Path(path).stem)
+        return cls(load_file(path), policy_name(path))
 
     def join(self, plant: Plant) -> None:
         """Set the geometry of the team on `plant`, if the policy takes it. Must precede the first call."""

@@ -208,7 +208,6 @@ def _simulated(source: str, changes: Mapping[str, Any], physics: str, plant: Pat
             setup = native
         seconds = tuples.get("seconds", standard_scenarios(setup)[0].seconds)
         follower = load_policy(file, setup, seconds=seconds)
-        follower.name = path.name if path.is_dir() else follower.name
     scenario = dataclasses.replace(standard_scenarios(setup)[0], **tuples)
     if "mass" in changes:
         configs.check_lift(setup, changes["mass"])

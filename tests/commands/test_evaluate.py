@@ -229,7 +229,7 @@ def test_no_arguments_judge_every_shipped_policy_and_baseline(tmp_path: Path) ->
 @pytest.mark.slow
 def test_a_policy_meets_its_card_on_mjx(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(main, [TRANSPORT, "--check", "--seconds", 1]) == 0
-    assert "check transport: ok" in capsys.readouterr().out
+    assert "check transport-large: ok" in capsys.readouterr().out
 
 
 def test_check_fails_a_policy_that_misses_its_card(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,16 +239,18 @@ def test_check_fails_a_policy_that_misses_its_card(tmp_path: Path, capsys: pytes
     assert call(main, [*FAST, strict, TRANSPORT, "--check"]) == 1
     printed = capsys.readouterr().out
     assert "check strict: x_peak" in printed
-    assert "check transport: ok" in printed
+    assert "check transport-large: ok" in printed
 
 
-def test_policies_of_one_stem_are_called_by_their_directory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "policy.npz").write_bytes(TRANSPORT.read_bytes())
-    paths = [tmp_path / name / "policy.npz" for name in ("a", "b")]
+def test_a_run_s_policy_has_its_name_and_equal_names_their_directory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [tmp_path / name for name in ("first/policy.npz", "a/mine.npz", "b/mine.npz")]
+    for path in paths:
+        path.parent.mkdir()
+        path.write_bytes(TRANSPORT.read_bytes())
     assert call(main, [*paths, "--seconds", "1", "--json", tmp_path / "cells.json", *FAST]) == 0
-    assert [cell["follower"] for cell in cells_of(tmp_path / "cells.json")] == ["a/policy", "b/policy"]
+    assert [cell["follower"] for cell in cells_of(tmp_path / "cells.json")] == ["first", "a/mine", "b/mine"]
 
 
 def test_a_policy_for_another_rate_flies_only_when_forced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -112,7 +112,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_report_says_how_it_was_made(written: Path) -> None:
     text = (written / "report.html").read_text()
     assert "python eval.py policies/archive/transport-large.npz --followers copy adaptive" in text
-    assert "metadata of <b>transport</b>" in text
+    assert "metadata of <b>transport-large</b>" in text
     assert "image/webp;base64" in text or "No picture: MuJoCo" in text
     assert len(json.loads((written / "cells.json").read_text())["cells"]) == 4 * 3
 

@@ -49,7 +49,7 @@ def test_what_is_flown_is_the_reference(flight: Flight):
     assert len(flight["time"]) == 201
     assert np.linalg.norm(flight["target"][0] - flight["position"][0]) == pytest.approx(np.sqrt(3))
     assert np.linalg.norm(flight["target"][-1] - flight["position"][-1]) < 0.05  # it settles within 2 s
-    assert flight.title == "transport: CG ±5 cm at 0.31 rad/s, 0.2 kg"
+    assert flight.title == "transport-large: CG ±5 cm at 0.31 rad/s, 0.2 kg"
 
 
 @pytest.mark.parametrize(
