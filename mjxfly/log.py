@@ -1,7 +1,7 @@
 """Figures and errors of a recorded flight, or a file for other programs: `python -m mjxfly.log LOG OUT`.
 
 LOG is a flight log (.jsonl), a bag or cfclient's folder. OUT ends in .mcap (ROS 2 messages; of .jsonl alone), .csv or
-.parquet; or it is a new directory, for figures of the flight beside the simulation of the same commands.
+.parquet; or it is a new directory, for figures of the flight, with --simulate beside the simulation of its setpoints.
 """
 
 from __future__ import annotations
@@ -9,26 +9,30 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mjxball import cli, running
-from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
-from mjxball.evaluate.plots import PANELS, plot_flights
+from mjxball.evaluate.plots import PANELS, draw_flights
 from mjxball.evaluate.results import Result, scenario_title
-from mjxball.plotting import SIMULATED, STYLES, file_format, style
+from mjxball.plotting import BROWN, INK, SIMULATED, STYLES, file_format, save, style
 from mjxball.sim.scenario import Scenario
-from mjxball.sim.trajectory import Trajectory
 from mjxball.terminal import warn
+from mjxball.view.flight import Mark
 from mjxfly.log_export import WRITERS
 from mjxfly.log_import import UNKNOWN
-from mjxfly.recording import Recording, read_recording, simulate_setpoints
+from mjxfly.recording import Recording, read_recording, simulate_setpoints, trajectory_of
 from mjxfly.twin.conditions import Conditions
+from mjxfly.view.marks import marks_of_log
 
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
+CLOSE = 0.04  # share of a flight's length below which names of phases would overlap
+FAULT = BROWN
 DIVERGED = 0.25  # [m] difference from which the open-loop simulation is not plotted any more
 ASSUMED = tuple((kind, index, f"assumed {text}" if kind == "cg_offset" else text) for kind, index, text in PANELS)
 
@@ -41,6 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("out", type=Path, metavar="OUT", help="new file, whose ending says what, or new directory")
     about = "figures of a bag: shipped plant, or file of the rig that flew"
     parser.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
+    about = "figures: also simulate the setpoints as sent, open loop, and print the differences"
+    parser.add_argument("--simulate", action="store_true", help=about)
     about = "of figures: screen (default), or paper: PDF of a column's width"
     parser.add_argument("--style", choices=STYLES, default="screen", help=about)
     options = parser.parse_args(arguments)
@@ -50,20 +56,20 @@ def main(arguments: list[str] | None = None) -> int:
 def _plot_or_export(options: argparse.Namespace) -> int:
     out, kind = options.out, options.out.suffix
     if not kind:
-        return evaluate_log(options.log, out, options.style, options.plant)
+        return evaluate_log(options.log, out, options.style, options.plant, options.simulate)
     if kind not in WRITERS:
         endings = ", ".join(WRITERS)
         raise InputError(f"output {out} must end in {endings}, which chooses the format, or in none: a directory")
-    if options.plant or options.style != "screen":
-        raise InputError(f"--plant and --style belong to figures, and {out} is a file")
+    if options.plant or options.simulate or options.style != "screen":
+        raise InputError(f"--plant, --simulate and --style belong to figures, and {out} is a file")
     for remark in WRITERS[kind](cli.output_file(out, kind), options.log):
         warn(f"note: {remark}")
     print(out)  # noqa: T201
     return 0
 
 
-def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None) -> int:
-    """Plot the log `path` into the new directory `out` and print the simulation's errors; return the exit code.
+def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None, simulate: bool = False) -> int:
+    """Plot the log `path` into the new directory `out`; with `simulate` beside the simulation; return the exit code.
 
     `plant` is the rig that flew, for a log that does not name it. Raises InputError if the log does.
     """
@@ -73,11 +79,21 @@ def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None
     cli.output_directory(out)
     for remark in recording.remarks:
         warn(remark)
-    recorded = result_of(recording, f"{recording.policy}, flown")
-    simulated = result_of(simulate_setpoints(recording), SIMULATED)
-    print(differences(recorded, simulated))  # noqa: T201
+    recorded, simulated = result_of(recording, f"{recording.policy}, flown"), None
+    if simulate:
+        simulated = result_of(simulate_setpoints(recording), SIMULATED)
+        print(differences(recorded, simulated))  # noqa: T201
+    marks = marks_of_log(path, float(recording.time[-1]))
+    for mark in marks:
+        if mark.kind != "phase":
+            print(f"{mark.time:6.1f} s  {mark.text}")  # noqa: T201
     with style(look):
-        print(f"figure: {draw(recorded, simulated, recording.guided_rows, out)}")  # noqa: T201
+        first = next((mark.text for mark in marks if mark.kind == "fault"), "no fault")
+        figure = draw(recorded, simulated, recording.guided_rows, f"{path.name}: {recording.policy}, {first}", marks)
+        path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
+        out.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
+    print(f"figure: {path}")  # noqa: T201
     return 0
 
 
@@ -91,35 +107,35 @@ def result_of(recording: Recording, name: str) -> Result:
     return Result(name, scenario, metrics, flight, config.motion.kind)
 
 
-def trajectory_of(recording: Recording) -> Trajectory:
-    """A recording as a trajectory."""
-    return Trajectory(
-        time=recording.time,
-        position=recording.position,
-        velocity=recording.velocity,
-        euler=rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion)),
-        rates=recording.rates,
-        quaternion=recording.quaternion,
-        rotor_force=recording.rotor_force,
-        leader_command=recording.leader,
-        follower_command=recording.follower,
-        observation=recording.observation,
-        cg_offset=recording.cg_offset,
-        target=recording.target,
-        diverged=np.zeros(len(recording.time), bool),
-    )
-
-
-def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
-    """Plot a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file.
+def draw(recorded: Result, simulated: Result | None, guided: int, title: str, marks: Sequence[Mark]) -> Any:
+    """Figure of a recorded flight with its phases and faults, and of the simulated one until it is `DIVERGED`.
 
     The goal is plotted for the first `guided` rows. Mass and CG of the object are assumed: the log lacks them.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    both = [without_goal(recorded, guided), _cut(without_goal(simulated, guided), valid_rows(recorded, simulated))]
-    path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
-    plot_flights(both, f"assumed: {scenario_title(recorded)}", path, ASSUMED)
-    return path
+    flights, panels = [without_goal(recorded, guided)], [panel for panel in ASSUMED if panel[0] != "cg_offset"]
+    if simulated is not None:
+        flights.append(_cut(without_goal(simulated, guided), valid_rows(recorded, simulated)))
+        title, panels = f"{title}\nassumed for the simulation: {scenario_title(recorded)}", list(ASSUMED)
+    figure = draw_flights(flights, title, panels)
+    _draw_marks(figure.axes, marks, float(recorded.flight.time[-1]))
+    return figure
+
+
+def _draw_marks(axes: Sequence[Any], marks: Sequence[Mark], last: float) -> None:
+    """Lines where phases and faults begin, named above the first panel; names of what is close together are joined."""
+    groups: list[list[Mark]] = []
+    for mark in (one for one in marks if one.kind != "end"):
+        close = bool(groups) and mark.time - groups[-1][0].time < CLOSE * last
+        groups[-1].append(mark) if close else groups.append([mark])
+    for group in groups:
+        fault = any(one.kind == "fault" for one in group)
+        colour, dash = (FAULT, "-") if fault else (INK, ":")
+        for axis in axes:
+            axis.axvline(group[0].time, color=colour, linestyle=dash, linewidth=0.8, zorder=1)
+        text = ", ".join(dict.fromkeys(one.text.partition(":")[0] for one in group))
+        top = axes[0].get_xaxis_transform()
+        where = {"transform": top, "rotation": 35, "rotation_mode": "anchor", "va": "bottom", "ha": "left"}
+        axes[0].text(group[0].time, 1.03, text, color=colour, fontsize="small", **where)
 
 
 def differences(recorded: Result, simulated: Result) -> str:

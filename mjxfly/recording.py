@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control import crazyflie
+from mjxball.control import crazyflie, rotations
 from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
 from mjxball.reading import check_times
+from mjxball.sim.trajectory import Trajectory
 from mjxfly import flight_log, log_consistency
 from mjxfly.limits import NAMES, ticks_per_command
 from mjxfly.log_consistency import SILENCE
@@ -307,6 +308,25 @@ def drone_kind_of(recording: Recording) -> DroneKind:
         named = ", ".join(f"{name} {own}" for name, own in zip(NAMES, recording.setup.curves, strict=True))
         raise InputError(f"the flight was flown on two force curves ({named}), and the twin's drones have one")
     return drone_kind(drone_of(recording.config), curve)
+
+
+def trajectory_of(recording: Recording) -> Trajectory:
+    """A recording as a trajectory."""
+    return Trajectory(
+        time=recording.time,
+        position=recording.position,
+        velocity=recording.velocity,
+        euler=rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion)),
+        rates=recording.rates,
+        quaternion=recording.quaternion,
+        rotor_force=recording.rotor_force,
+        leader_command=recording.leader,
+        follower_command=recording.follower,
+        observation=recording.observation,
+        cg_offset=recording.cg_offset,
+        target=recording.target,
+        diverged=np.zeros(len(recording.time), bool),
+    )
 
 
 def simulate_setpoints(recording: Recording, kind: DroneKind | None = None) -> Recording:

@@ -40,8 +40,9 @@ FLOORS = (
     {"commands", "export"},
     {"entry"},
     {"mjxfly"},
-    {"mjxfly.rig", "mjxfly.log"},
+    {"mjxfly.rig"},
     {"mjxfly.view"},
+    {"mjxfly.log"},
     {"mjxfly.entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}

@@ -10,10 +10,9 @@ import numpy as np
 from mjxball.errors import InputError
 from mjxball.terminal import warn
 from mjxball.view.flight import Flight, check_flight, flight_of
-from mjxfly.log import trajectory_of
 from mjxfly.log_bags import is_bag
 from mjxfly.log_import import UNKNOWN
-from mjxfly.recording import read_recording
+from mjxfly.recording import read_recording, trajectory_of
 from mjxfly.view.marks import marks_of_log
 
 

@@ -81,7 +81,7 @@ def test_a_bag_of_ours_is_the_log_itself(log: Path, flight: Recording, exported:
 
 @pytest.mark.slow
 def test_its_report_has_the_same_numbers(log: Path, exported: Path, tmp_path: Path, capsys) -> None:
-    reports = [printed(export, [path, tmp_path / path.suffix[1:]], capsys) for path in (log, exported)]
+    reports = [printed(export, [path, tmp_path / path.suffix[1:], "--simulate"], capsys) for path in (log, exported)]
     assert reports[0] == reports[1]
     assert len(reports[0]) > 2
 
@@ -110,21 +110,32 @@ def test_a_bag_of_crazyswarm2(
 def test_a_figure_has_what_a_recording_has(
     ours: bool, log: Path, records: list[Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No panel and no entry of the legend is empty; the CG, which no log has, is called assumed."""
+    """No panel and no entry of the legend is empty; the CG, which no log has, is called assumed. Phases have names."""
     path = log if ours else write_bag(tmp_path / "bag", records, odometry=True)
     panels: dict[str, int] = {}
     legend: list[str] = []
+    phases: list[str] = []
 
     def keep(figure: Any) -> None:
         assert all(np.isfinite(line.get_ydata()).any() for panel in figure.axes for line in panel.lines)
-        panels.update({panel.get_ylabel(): len(panel.lines) for panel in figure.axes})
+        curves = {panel: [one for one in panel.lines if len(one.get_xdata()) > 2] for panel in figure.axes}
+        panels.update({panel.get_ylabel(): len(lines) for panel, lines in curves.items()})
+        phases.extend(text.get_text() for text in figure.axes[0].texts)
         legend.extend(text.get_text() for text in figure.legends[0].get_texts())
-        assert "assumed: CG" in figure.legends[0].get_title().get_text()
+        title = figure.legends[0].get_title().get_text()
+        assert title.startswith(f"{path.name}: ")
+        assert ("simulation: CG" in title) is ("simulated" in " ".join(legend))
 
     monkeypatch.setattr(pyplot(), "close", keep)
-    assert call(export, [path, tmp_path / "drawn"]) == 0
+    assert call(export, [path, tmp_path / "alone"]) == 0
+    assert "assumed CG offset [m]" not in panels
+    assert not any("simulated" in one for one in legend)
+    legend.clear()
+    panels.clear()
+    assert call(export, [path, tmp_path / "drawn", "--simulate"]) == 0
     monkeypatch.undo()
     pyplot().close("all")
+    assert any("fly" in one for one in phases) is ours
     motion = ["x [m]", "y [m]", "z [m]"]
     commands = ["roll command [deg]", "pitch command [deg]", "vertical command [m/s²]"]
     if ours:

@@ -109,9 +109,10 @@ def test_a_flight_is_what_the_pure_simulation_says(recording: Recording) -> None
 
 
 def test_a_log_is_drawn_and_played(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(draw, [log, tmp_path / "figures"]) == 0
-    assert "height mm" in capsys.readouterr().out
-    assert (tmp_path / "figures" / "flight.png").stat().st_size > 20_000
+    for flags in ([], ["--simulate"]):
+        assert call(draw, [log, tmp_path / f"figures{len(flags)}", *flags]) == 0
+        assert ("height mm" in capsys.readouterr().out) is bool(flags)
+        assert (tmp_path / f"figures{len(flags)}" / "flight.png").stat().st_size > 20_000
     assert call(view, [log, "--out", tmp_path / "page.html"]) == 0
     assert "nobody, flown" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
@@ -121,8 +122,9 @@ def test_a_log_is_drawn_and_played(log: Path, tmp_path: Path, capsys: pytest.Cap
     [
         (["nowhere.jsonl", "x"], "cannot be read"),
         (["log.jsonl", "x.xlsx"], "must end in .mcap, .csv, .parquet"),
-        (["log.jsonl", "x.csv", "--plant", "crazyflie"], "--plant and --style belong to figures"),
-        (["log.jsonl", "x.csv", "--style", "paper"], "--plant and --style belong to figures"),
+        (["log.jsonl", "x.csv", "--plant", "crazyflie"], "--plant, --simulate and --style belong to figures"),
+        (["log.jsonl", "x.csv", "--simulate"], "--plant, --simulate and --style belong to figures"),
+        (["log.jsonl", "x.csv", "--style", "paper"], "--plant, --simulate and --style belong to figures"),
     ],
 )
 def test_refusals(arguments: list[str], reason: str, tmp_path: Path, monkeypatch, capsys) -> None:
