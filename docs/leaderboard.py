@@ -27,7 +27,7 @@ KINDS = {
     "learned": sorted(path.stem for path in (REPOSITORY / "policies").rglob("*.npz")),
     "classical": sorted(CONTROLLERS),
 }
-COSTS = ("success %", "late mm", "limit %", "power", "change mrad")  # columns of the best of each kind
+COSTS = ("success %", "error mm", "limit %", "power", "change mrad")  # columns of the best of each kind
 COLUMNS = ["follower", "condition", *HEADS, "date, commit"]
 
 

@@ -13,40 +13,42 @@ from pathlib import Path
 
 from leaderboard import KINDS, best
 from mjxball.bench import CONDITIONS
+from mjxball.bench.success import interval
+from mjxball.bench.tracks import TRACKS
 from mjxball.cli import make_parser
 from mjxball.running import run_command
 
 REPOSITORY = Path(__file__).parents[1]
 README = REPOSITORY / "README.md"
 BLOCK = re.compile(r"(?<=<!-- docs/readme.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
-ROWS = {
-    "pair": "a pair",
-    "team": "a team of 3 to 6",
-    "rigs": "a random rig of 2 to 6",
-    "crazyflie": "two Crazyflies",
-}
+ROWS = ("pair", "team", "rigs", "crazyflie")
 RESULTS = REPOSITORY / "benchmarks" / "results"
 FIRST = {  # what README trains
     RESULTS / "first_command.json": (
-        "The first command below trains a follower for a pair in {seconds} s on two cores: {shares} %."
+        "`python train.py` trains a follower for a pair in {seconds} s on two cores: {shares} % (medians)."
     ),
-    RESULTS / "first_command_sac.json": "The paper's way, `--algorithm sac` on MJX: {shares} % after {seconds} s.",
+    RESULTS
+    / "first_command_sac.json": "The paper's SAC on MJX, with exact sensors ([`--algorithm sac`](docs/training.md#algorithms)): {shares} % after {seconds} s.",
 }
 
 
-def row(track: str, text: str) -> str:
-    """One line of the table: the best of each kind in each condition, the better one bold."""
-    return " | ".join([text, *(cell(track, condition) for condition in CONDITIONS)])
+def row(track: str) -> str:
+    """One line of the table: the best of each kind in each condition, the better one bold if that is certain."""
+    return " | ".join([TRACKS[track].title, *(cell(track, condition) for condition in CONDITIONS)])
 
 
 def cell(track: str, condition: str) -> str:
-    """The best classical and the best learned follower, and how often they succeed."""
+    """The best classical and the best learned follower, and how often they succeed; bold if intervals are apart."""
     found = [best(KINDS[kind], track, condition) for kind in ("classical", "learned")]
-    most, shown = max(share for share, _ in found), []
+    shown, ends = [], []
     for share, entries in found:
         if entries:
-            text = ", ".join(f"`{one['follower']}`" for one in entries) + f" {share:.0f}"
-            shown.append(f"**{text}**" if share == most else text)
+            flown = entries[0]["tracks"][track][condition]
+            ends.append(interval(flown["succeeded"], flown["flights"]))
+            shown.append(", ".join(f"`{one['follower']}`" for one in entries) + f" {share:.0f}")
+    for number, (low, _) in enumerate(ends):
+        if any(low > high for _, high in ends):
+            shown[number] = f"**{shown[number]}**"
     return ", ".join(shown) or "-"
 
 
@@ -64,7 +66,7 @@ def sentences() -> list[str]:
 
 def block() -> str:
     """The text of the block."""
-    table = ["task | calm | disturbed", "---|---|---", *(row(*one) for one in ROWS.items())]
+    table = ["task | calm | disturbed", "---|---|---", *(row(one) for one in ROWS)]
     return "\n".join(["", *table, "", *sentences(), "", ""])
 
 

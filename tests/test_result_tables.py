@@ -95,19 +95,19 @@ def first() -> Iterator[tuple[str, Numbers]]:
 
 
 def training() -> Iterator[tuple[str, Numbers]]:
-    for place, name in (("one H200", "training_h200"), ("two cores: `train", "training_2_cores")):
+    for place, name in (("one H200", "training_h200"), ("two cores", "training_2_cores")):
         found = measured(name)["summary"]
         (own,), brax = found["ours"], found["stock"][-1]
-        yield place, [own["cold"], own["warm"], own["x_peak"], own["settling_time"]]
+        yield f"{place}: `train", [own["cold"], own["warm"], own["x_peak"], own["settling_time"]]
         assert not brax["at the bar"]
         steps = f"{round(brax['steps'], -3):,}".replace(",", " ")
-        yield f"Brax, {steps} steps", [brax["cold"], brax["x_peak"], brax["settling_time"]]
+        yield f"{place}: Brax, {steps} steps", [brax["cold"], brax["x_peak"], brax["settling_time"]]
 
 
 def algorithms() -> Iterator[tuple[str, Numbers]]:
     for places, name in (
-        (("H200: SAC", "PPO", "gradients, on"), "algorithms_h200"),
-        (("two cores: SAC", "PPO", "gradients |"), "algorithms_2_cores"),
+        (("one H200: SAC", "one H200: PPO", "CPU of the H200's machine: gradients"), "algorithms_h200"),
+        (("two cores: SAC", "two cores: PPO", "two cores: gradients"), "algorithms_2_cores"),
     ):
         for place, algorithm in zip(places, ("sac", "ppo", "gradient"), strict=True):
             own = one(measured(name)["table"], algorithm=algorithm)

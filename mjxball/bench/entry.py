@@ -22,7 +22,7 @@ HEADS = [
     "95 %",
     *(f"{name} %" for name in REASONS),
     "arrival",
-    "late mm",
+    "error mm",
     "power",
     "limit %",
     "change mrad",

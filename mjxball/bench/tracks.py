@@ -224,7 +224,7 @@ TRACKS: dict[str, Track] = {
         Track("pair", "pair, mass known", lambda draw: _pair(draw, True)),
         Track("pair-unknown", "pair, mass unknown", lambda draw: _pair(draw, False)),
         Track("team", "teams of 3 to 6", _team),
-        Track("rigs", "any rig", _rigs),
+        Track("rigs", "random rigs", _rigs),
         Track("crazyflie", "two Crazyflies", _crazyflie),
         Track("moving", "pair, goals that move", _moving),
     )

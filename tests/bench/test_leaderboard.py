@@ -45,7 +45,7 @@ def test_cells_show_shares_with_their_interval_and_a_dash_for_never() -> None:
     shown = dict(zip(HEADS, cells(results(arrival_ratio=None)), strict=True))
     assert (shown["success %"], shown["95 %"]) == ("83", "76 - 89")
     assert (shown["crashed %"], shown["late %"], shown["rotors %"]) == ("2", "3", "8")
-    assert (shown["arrival"], shown["late mm"], shown["power"]) == ("-", "8.0", "1.020")
+    assert (shown["arrival"], shown["error mm"], shown["power"]) == ("-", "8.0", "1.020")
 
 
 def test_an_entry_that_is_refused_and_two_of_one_follower_end_it(
