@@ -78,7 +78,7 @@ def test_the_block_has_a_row_for_every_task_and_names_the_best(entered: Any) -> 
     assert len(text.splitlines()) == len(empty.splitlines())
     worse = {**usual, "calm": {**reasons(late=44), "succeeded": 60, "late_error_90": 0.5}}
     apart = entered(lqg={"pair": usual}, balance={"pair": worse}).splitlines()
-    assert apart[3].split(" | ")[1] == "**`lqg` 83**, `balance` 50"
+    assert apart[3].split(" | ")[1] == "**`copy`, `lqg` 83**, `balance` 50"
     rows = [line.strip("| ").split(" | ") for line in leaderboard.bests().splitlines()[2:]]
     assert [row[:5] for row in rows] == [
         ["pair, mass known", "calm", "learned", "`balance`", "83"],
