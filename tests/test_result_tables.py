@@ -155,6 +155,12 @@ def onboard() -> Iterator[tuple[str, Numbers]]:
         yield name, [*(number for row in own for number in (row["flash"] / 1e3, row["ms"])), own[1]["error_rms"]]
 
 
+def ablation() -> Iterator[tuple[str, Numbers]]:
+    for row in measured("ablation")["rows"]:
+        part = row["left out"].replace("; loops known", ", but each LQG is given")
+        yield part, [100 * row[name] for name in ("lqg", "lqg-disturbed", "balance")]
+
+
 SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Stability": ("results", stability),
     "Modes of the team at hover": ("archive/rigs", modes),
@@ -165,6 +171,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),
     "Other trainers": ("gym", trainers),
+    "Which disturbances matter": ("leaderboard", ablation),
     "Two Crazyflies": ("results", crazyflies),
     "Two Crazyflies ": ("results", twin),
     "Cost and tests": ("hardware", onboard),
