@@ -27,8 +27,10 @@ FIRST = {  # what README trains
     RESULTS / "first_command.json": (
         "`python train.py` trains a follower for a pair in {seconds} s on two cores: {shares} % (medians)."
     ),
-    RESULTS
-    / "first_command_sac.json": "The paper's SAC on MJX, with exact sensors ([`--algorithm sac`](docs/training.md#algorithms)): {shares} % after {seconds} s.",
+    RESULTS / "first_command_sac.json": (
+        "The paper's SAC on MJX, with exact sensors "
+        "([`--algorithm sac`](docs/training.md#algorithms)): {shares} % after {seconds} s."
+    ),
 }
 
 
