@@ -213,7 +213,7 @@ def output_directory(path: Path, but: Sequence[str] = ()) -> Path:
     if not os.access(path if path.exists() else above, os.W_OK):
         raise InputError(f"output directory {path} cannot be written")
     if path.is_dir() and any(one.name not in but for one in path.iterdir()):
-        raise InputError(f"output directory {path} exists and is not empty; choose another with --out")
+        raise InputError(f"output directory {path} exists and is not empty; choose another")
     return path
 
 

@@ -30,6 +30,7 @@ from mjxfly.mocap import KINDS, MocapSettings, ready
 from mjxfly.mount_modes import add_mount_options, mount_of
 from mjxfly.parameters import check_mount, check_parameters
 from mjxfly.policy_setup import (
+    UNKNOWN_MASS,
     ThrustOptions,
     drone_of,
     goal_of,
@@ -327,6 +328,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             more = {**more[0], **given[0]}, {**more[1], **given[1]}
         if not is_crazyflie(config):
             check_simple(options, map(read_fault, options.fault))
+            grams = 1e3 * (choice.mass or UNKNOWN_MASS)
+            terminal.say(f"{options.policy} was made for another plant: two Crazyflies of {grams:g} g in all fly it")
         check_mount(config, variants(config, choice, more), mount_of(options, config.plant))
         rig = Rig.from_metadata(policy.metadata)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)

@@ -207,4 +207,4 @@ def test_commands_take_a_shipped_policy_by_its_name(tmp_path: Path, monkeypatch:
     assert policy_path("balance") == Path("balance")
     capsys.readouterr()
     assert evaluate(["balanced"]) == 2
-    assert "balanced does not exist; by name there are balance, " in capsys.readouterr().err
+    assert "balanced does not exist (did you mean balance?); by name there are balance" in capsys.readouterr().err

@@ -20,6 +20,7 @@ from mjxball.baselines.reference import Random, Stay
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Controller, Copy
 from mjxball.errors import InputError
+from mjxball.reading import near
 
 __all__ = [
     "BASELINES",
@@ -71,7 +72,7 @@ def _of_kind(
 def make_controller(name: str, config: Config) -> Controller:
     """The classical controller called `name` with gains that follow from `config`; InputError if unknown."""
     if name not in CONTROLLERS:
-        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(CONTROLLERS)}")
+        raise InputError(f"unknown follower {name!r}{near(name, CONTROLLERS)}; baselines are {', '.join(CONTROLLERS)}")
     return CONTROLLERS[name](config)
 
 

@@ -24,13 +24,13 @@ from mjxball.terminal import Status, Working, warn
 
 def add_policies(parser: argparse.ArgumentParser) -> None:
     """Add the positional arguments of a command that flies policies."""
-    about = "policy files, or names of shipped ones"
+    about = "policy files, run directories, names of shipped policies; also what --followers takes"
     parser.add_argument("policies", nargs="*", type=policy_path, metavar="POLICY.npz", help=about)
 
 
 def add_followers(parser: argparse.ArgumentParser) -> None:
     """Add the flag of a command that flies other followers too."""
-    about = f"baselines: {', '.join(CONTROLLERS)}; or module:Class, your own"
+    about = f"baselines: {', '.join(CONTROLLERS)}; module:Class, your own; or a policy"
     parser.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=about)
 
 
@@ -55,9 +55,15 @@ class Named:
 
 def named(options: argparse.Namespace) -> Named:
     """The followers that `options` name. Raises InputError for an unknown one."""
-    # In `--followers copy mine.npz` the file name is a policy.
-    files = [*options.policies, *(Path(name) for name in options.followers if name.endswith(".npz"))]
-    names = [name for name in options.followers if not name.endswith(".npz")]
+    files, names = [], []
+    for given in [*map(str, options.policies), *options.followers]:
+        path = policy_path(given)
+        if given in CONTROLLERS or (":" in given and not path.exists()):
+            names.append(given)
+        elif path.exists() or path.suffix == ".npz" or path in options.policies:
+            files.append(path / "policy.npz" if path.is_dir() else path)
+        else:
+            names.append(given)
     for name in names:
         _maker(name)
     asked = bool(files or names)

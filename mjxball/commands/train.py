@@ -275,7 +275,10 @@ def _run(
     except TrainingDivergedError as error:
         if processes.is_writer():
             saved = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))
-            where = f"the last good policy and checkpoint are in {out}" if saved else "no checkpoint came before"
+            where = f"the last good policy and checkpoint are in {out}"
+            if not saved:
+                (out / POLICY).unlink(missing_ok=True)  # the untrained network
+                where = "no checkpoint came before, so there is no policy; a reward that is not finite does this"
             warn(f"training diverged: {error}; {where}")
         return 1
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjxball.config import Config, ball_limit, preset, thrust_over_weight, total_mass
+from mjxball.config import Config, ball_limit, cg_limit, preset, thrust_over_weight, total_mass
 from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.plant.trim import heaviest_object, largest_amplitude
@@ -59,7 +59,7 @@ def rig_summary(settings: Config, mass: float | None = None) -> str:
     plant, margin = settings.plant, settings.scenario.trim_margin
     reference = of_plant(settings, Scenario())
     mass = reference.mass if mass is None else mass
-    offset = largest_amplitude(settings, mass, margin)
+    offset = min(largest_amplitude(settings, mass, margin), cg_limit(plant))
     heaviest = heaviest_object(settings, reference.amplitude)
     trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
     return (

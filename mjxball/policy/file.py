@@ -27,7 +27,7 @@ from mjxball.control.observation import (
 from mjxball.errors import InputError
 from mjxball.files import write_atomically
 from mjxball.policy.container import PolicyFileError, read_arrays
-from mjxball.reading import is_number, parse_json
+from mjxball.reading import is_number, near, parse_json
 
 # 5: with a GRU (arrays GRU_ARRAYS); with `context` in the metadata its inputs include the geometry of the team.
 FORMAT_VERSIONS = (1, 5)
@@ -137,7 +137,8 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     except PolicyFileError as error:
         if os.path.lexists(path):
             raise
-        raise PolicyFileError(f"{error}; by name there are {', '.join(_shipped()) or 'none'}") from None
+        known = _shipped()
+        raise PolicyFileError(f"{error}{near(name, known)}; by name there are {', '.join(known) or 'none'}") from None
     for needed in ("observation_mean", "observation_scale", "action_scale", "card"):
         if needed not in arrays:
             foreign = (

@@ -183,6 +183,12 @@ class Run:
         if self._writes:  # Orbax takes a second to import, which overlaps with training here
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
+        left = self.seconds_left()
+        if left is not None and left < self.progress.elapsed():
+            self.progress.say(
+                f"that leaves {left:.0f} s of --minutes to train; compiled programs are kept, so the same command "
+                "trains longer the next time"
+            )
         self.progress.begin("training")
 
     def end(self, finished: bool) -> None:

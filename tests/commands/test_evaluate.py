@@ -253,6 +253,14 @@ def test_a_run_s_policy_has_its_name_and_equal_names_their_directory(
     assert [cell["follower"] for cell in cells_of(tmp_path / "cells.json")] == ["first", "a/mine", "b/mine"]
 
 
+def test_policies_runs_and_baselines_may_stand_with_or_without_the_flag(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "policy.npz").write_bytes(TRANSPORT.read_bytes())
+    given = [tmp_path / "mine", "copy", "--followers", "paper", "adaptive"]
+    assert call(main, [*given, "--seconds", "1", "--json", tmp_path / "cells.json", *FAST]) == 0
+    assert {cell["follower"] for cell in cells_of(tmp_path / "cells.json")} == {"mine", "copy", "paper", "adaptive"}
+
+
 def test_a_policy_for_another_rate_flies_only_when_forced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arrays, metadata = load_arrays(TRANSPORT)
     write_arrays(tmp_path / "slow.npz", arrays, {**metadata, "control_period": 0.04})

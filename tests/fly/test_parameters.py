@@ -60,5 +60,5 @@ def test_other_parameters_are_those_of_the_positioning() -> None:
 
 
 def test_a_policy_of_another_rig_is_held_against_one_drone_alone() -> None:
-    assert not refused("sac", {"pid_attitude.roll_kp": 4.5, "pid_rate.roll_kd": 3.0}, {})
-    assert refused("sac", {}, {"pid_attitude.roll_kp": 0.0})
+    assert not refused("balance-sac", {"pid_attitude.roll_kp": 4.5, "pid_rate.roll_kd": 3.0}, {})
+    assert refused("balance-sac", {}, {"pid_attitude.roll_kp": 0.0})
