@@ -114,3 +114,8 @@ def vector(state: Any, action: Any, after: Any) -> Any:
 
 def binary(state: Any, action: Any) -> Any:
     return 0.0
+
+
+def unsound(state: Any, action: Any, after: Any) -> Any:
+    """A reward that is not finite."""
+    return 0.0 * after.metrics["error"] + jnp.nan

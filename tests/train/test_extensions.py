@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import toys
-from command_line import REPOSITORY, environment
+from command_line import REPOSITORY, call, environment, tiny
 from conftest import with_settings
 from tables import weekly
 
@@ -222,3 +222,10 @@ def test_our_environment_and_algorithm_need_no_exception() -> None:
     env = make_env(Extensions(env=TransportEnv), preset("transport"), "newton-euler")
     assert isinstance(env, TransportEnv)
     assert {"init", "collect", "update", "policy"} <= set(vars(SoftActorCritic))
+
+
+@pytest.mark.slow
+def test_a_reward_that_is_not_finite_ends_the_training_and_leaves_no_policy(tmp_path: Path, capsys) -> None:
+    assert call(main, ["transport", "--reward", "toys:unsound", "--out", tmp_path / "run", *tiny()]) == 1
+    assert "a reward that is not finite does this" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "policy.npz").exists()
