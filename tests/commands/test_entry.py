@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from command_line import REPOSITORY, assert_one_line, environment, run
+from command_line import REPOSITORY, assert_one_line, environment, run, without_progress
 from tables import rows
 
 from mjxball import __version__
@@ -135,7 +135,7 @@ def test_without_the_train_extra_a_command_says_what_to_install(tmp_path: Path) 
         env=environment(),
     )
     assert done.returncode == 2
-    *told, refusal = done.stderr.splitlines()
+    *told, refusal = without_progress(done.stderr).splitlines()
     assert all(
         line.startswith("warning: ") for line in told
     )  # of policies that are flown beyond what they are good for
