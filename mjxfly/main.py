@@ -329,9 +329,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not is_crazyflie(config):
             check_simple(options, map(read_fault, options.fault))
             grams = 1e3 * (choice.mass or UNKNOWN_MASS)
-            terminal.say(
-                f"{options.policy.name} was made for another plant: two Crazyflies of {grams:g} g in all fly it"
-            )
+            terminal.say(f"{options.policy.name} was made for another plant: two Crazyflies of {grams:g} g fly it")
         check_mount(config, variants(config, choice, more), mount_of(options, config.plant))
         rig = Rig.from_metadata(policy.metadata)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)

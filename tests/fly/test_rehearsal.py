@@ -91,7 +91,7 @@ def name(request: pytest.FixtureRequest) -> str:
 def flown(name: str, flights: dict[str, Ended]) -> Path:
     """The log of the rehearsal."""
     code, out, err, log = flights[name]
-    assert (code, err) == (0, ""), out
+    assert (code, err) == (0, ""), f"{err}{out}"  # pytest shortens err, which a busy machine is known by
     return log
 
 
@@ -141,7 +141,7 @@ def test_runner_watchdog_and_twin_share_a_slower_clock(onboard: tuple[str, ...],
     process = started("flight", tmp_path / "slow.jsonl", "--slow", "3", *onboard)
     out, err = process.communicate(timeout=200)
     took = time.monotonic() - began
-    assert (process.returncode, err) == (0, ""), out
+    assert (process.returncode, err) == (0, ""), f"{err}{out}"
     ticks = [record for record in read(tmp_path / "slow.jsonl") if record["kind"] == "tick"]
     flown = [record["t"] for record in ticks if record["state"] == "fly"]
     assert flown[-1] - flown[0] == pytest.approx(3.0, abs=0.1)  # as long as it was to be, by its own clock
