@@ -122,12 +122,12 @@ def test_it_flies_and_its_commands_simulated_begin_the_same(name: str, flown: Pa
     assert np.abs(apart).max() < 0.05
 
 
-def test_the_last_line_tells_where_the_object_is(name: str, flights: dict[str, Ended]) -> None:
+def test_the_last_line_tells_where_the_object_is(name: str, flown: Path, flights: dict[str, Ended]) -> None:
     """By the twin, not by what the runner believes."""
     told = PLACE.findall(flights[name].out.splitlines()[-1])
     assert len(told) == 1
     assert told[0][3] == "off"
-    recording = read_recording(flights[name].log)
+    recording = read_recording(flown)
     moved = recording.position[-1] - recording.position[0]
     assert np.abs(np.array(told[0][:3], float) - moved).max() < 0.03  # the estimators' noise on a stand
 
