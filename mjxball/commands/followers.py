@@ -24,13 +24,13 @@ from mjxball.terminal import Status, Working, warn
 
 def add_policies(parser: argparse.ArgumentParser) -> None:
     """Add the positional arguments of a command that flies policies."""
-    about = "policy files, run directories, names of shipped policies; also what --followers takes"
+    about = "policy files, or names of shipped ones"
     parser.add_argument("policies", nargs="*", type=policy_path, metavar="POLICY.npz", help=about)
 
 
 def add_followers(parser: argparse.ArgumentParser) -> None:
     """Add the flag of a command that flies other followers too."""
-    about = f"baselines: {', '.join(CONTROLLERS)}; module:Class, your own; or a policy"
+    about = f"baselines: {', '.join(CONTROLLERS)}; module:Class, your own; policies and run directories; the flag may be left out"
     parser.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=about)
 
 
