@@ -30,7 +30,7 @@ def add_policies(parser: argparse.ArgumentParser) -> None:
 
 def add_followers(parser: argparse.ArgumentParser) -> None:
     """Add the flag of a command that flies other followers too."""
-    about = f"baselines: {', '.join(CONTROLLERS)}; module:Class, your own; policies and run directories; the flag may be left out"
+    about = f"baselines: {', '.join(CONTROLLERS)}; module:Class, your own; policies. The flag may be left out"
     parser.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=about)
 
 
