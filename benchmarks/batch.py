@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Controller, Follower, residual_on_pid
+from mjxball.control.followers import Baseline, Controller, Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics, results, rotor_limits
 from mjxball.evaluate.running_metrics import RunningMetrics, begin, update
@@ -46,7 +46,6 @@ def fly_compiled(
     step = (scalar_form if rewritten else jax.vmap)(make_plant_step(config, engine, jax_repeat))
     loop = ClosedLoop(config, step, flown.sensors, jitters=flown.inputs.late is not None)
     privileged = make_privileged_info(config)
-    on_pid = np.float32(residual_on_pid(follower))
     leader, limit = config.plant.leader, config.scenario.termination_distance
 
     def fly(load: Any, start: Any, inputs: Inputs, first: Any, most: Any) -> RunningMetrics:
@@ -55,7 +54,7 @@ def fly_compiled(
         running = begin(start.position, goal.position, start.rotor_force, leader)
 
         def advance(carried: Any, now: Inputs) -> tuple[Any, None]:
-            carry, row = control_step(loop, controller, privileged, load, carried[0], now, on_pid)
+            carry, row = control_step(loop, controller, privileged, load, carried[0], now)
             return (carry, update(carried[1], row, limit, most, leader)), None
 
         carried = Carry(state, observation, controller.start(observation)), running

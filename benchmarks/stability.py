@@ -154,7 +154,7 @@ def closed_loop(
         plant = PlantState(position, turn, velocity, rates, rotors, begin, zero, zero, zero)
         past = jnp.concatenate([loop.observe(plant, goal)[None, ..., :OWN_STATE], older])
         late = SensorState(SensorSettings(delay), past=past) if delay else ()
-        state = LoopState(plant, loop.zero_integral(still), late, jnp.zeros((), bool))
+        state = LoopState(plant, jnp.zeros_like(still), late, jnp.zeros((), bool))
         carry = rollout.Carry(state, loop.observe_by(past[-1], goal), memory)
         inputs = rollout.Inputs(zero, Goal(goal), Goal(goal), None, None, Sample())
         (moved, _, memory), _ = rollout.control_step(loop, controller, privileged, load, carry, inputs, 0.0)

@@ -43,17 +43,16 @@ CASES = {
     "thrust -8/+8 %": Surroundings(gains=(0.92, 1.08)),
     "thrust -5/-5 %": Surroundings(gains=(0.95, 0.95)),
 }
-# (drone of `DRONES`, shipped plant, shipped policy), and the followers that any of these plants can have
-DRONES = (
-    ("2.1", "crazyflie", "flight"),
-    ("thrust-upgrade", "crazyflie-thrust-upgrade", "flight-upgrade"),
-    ("brushless", "crazyflie-brushless", "flight-brushless"),
-)
-FOR_ANY = ("universal", *CLASSICAL)
+DRONES = {  # plant of each of the twin's drones
+    "2.1": "crazyflie",
+    "thrust-upgrade": "crazyflie-thrust-upgrade",
+    "brushless": "crazyflie-brushless",
+}
+FOLLOWERS = ("flight", "universal", *CLASSICAL)
 WORST = ("rms", "largest", "sideways", "tilt", "limit", "change", "touchdown")
 
 
-def flown(case: str, follower: str, plant: str | None, seed: int) -> Row:
+def flown(case: str, follower: str, plant: str, seed: int) -> Row:
     """One flight."""
     one = of_pair(follower, plant)
     config = FlightController(one).config
@@ -84,33 +83,31 @@ def flown(case: str, follower: str, plant: str | None, seed: int) -> Row:
     }
 
 
-def of_pair(follower: str, plant: str | None) -> Policy | ClassicalFollower:
-    """The follower, of `plant` if it may fly any of them."""
+def of_pair(follower: str, plant: str) -> Policy | ClassicalFollower:
+    """The follower, for the pair of `plant`."""
     path = policy_path(follower)
-    if plant is None or follower in CLASSICAL:
-        return load_follower(path, None if plant is None else Path(plant))
+    if follower in CLASSICAL:
+        return load_follower(path, Path(plant))
     with tempfile.TemporaryDirectory() as folder:
-        exported = Path(folder) / f"{follower}.npz"
-        save_file(exported, in_team(load_file(path), follower, Path(plant)))
+        exported = Path(folder) / path.name
+        save_file(exported, in_team(load_file(path), path.stem, Path(plant)))
         return load_follower(exported)
 
 
 def main(given: Sequence[str] | None = None) -> int:
     """Command line."""
     parser = arguments(__file__, __doc__ or "")
-    parser.add_argument("--drones", nargs="+", choices=[name for name, *_ in DRONES], help="kinds (all)")
-    parser.add_argument("--followers", nargs="+", help="some of them (all)")
+    parser.add_argument("--drones", nargs="+", choices=DRONES, default=list(DRONES), help="kinds (all)")
+    parser.add_argument("--followers", nargs="+", default=FOLLOWERS, help="policies and classical ones (all shipped)")
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="conditions (all)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="flights of each (2)")
     options = parser.parse_args(given)
     cases = [
-        (drone, case, follower, plant if follower in FOR_ANY else None)
-        for drone, plant, policy in DRONES
-        if not options.drones or drone in options.drones
+        (drone, case, follower, DRONES[drone])
+        for drone in options.drones
         for case in options.cases
-        for follower in (policy, *FOR_ANY)
-        if not options.followers or follower in options.followers
+        for follower in options.followers
     ]
     rows: list[Row] = []
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:

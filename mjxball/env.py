@@ -196,14 +196,14 @@ class TransportEnv:
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, jnp.clip(action, -1.0, 1.0), jnp.zeros_like(action)) * self._action_mask
         command, memory = self._answered(action, self._observed(state), world.memory)
-        return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, plant_step)
+        return self._step(state, command, memory, action, ~finite | world.loop.diverged, plant_step)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
         """`step` with the command of a follower that is no network, which is applied unchanged."""
         world = state.pipeline_state
         action = jnp.zeros((*follower_command.shape[:-1], self.action_size))
         memory = self._remembered(world.memory, self._observed(state), action)
-        return self._step(state, follower_command, memory, action, world.loop.diverged, 0.0)
+        return self._step(state, follower_command, memory, action, world.loop.diverged)
 
     def commands(self, state: State, action: Float[Array, "... 3"]) -> tuple[Float[Array, "drones 3"], Load]:
         """(commands of all drones, load) that `step` passes to the physics at the network's `action`."""
@@ -226,10 +226,9 @@ class TransportEnv:
         memory: Any,
         action: Float[Array, "... actions"],
         diverged: Bool[Array, ""],
-        on_pid: float,
         plant_step: PlantStep | None = None,
     ) -> State:
-        """The next state after the followers' `command`, with their new `memory`. `on_pid`: see `ClosedLoop.step`."""
+        """The next state after the followers' `command`, with their new `memory`."""
         world: PipelineState = state.pipeline_state
         observation = self._observed(state)
         load, steps = world.load, world.steps + 1
@@ -238,7 +237,7 @@ class TransportEnv:
         disturbances, sample = self._disturbances.step(world.disturbances)
         before, goals = world.loop._replace(diverged=diverged), (self.goal(world), self.goal(world, steps))
         closed_loop = self._loop_of(world.parameters)
-        loop, after, commands = closed_loop.step(before, observation, command, load, goals, sample, on_pid, plant_step)
+        loop, after, commands = closed_loop.step(before, observation, command, load, goals, sample, plant_step)
         moved = world._replace(
             loop=loop,
             goal=goals[1].position,
@@ -301,11 +300,9 @@ class TransportEnv:
         parameters = () if rig is None else rig.parameters if rig.row is None else rig.row.parameters
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         settings = disturbances.settings if self._disturbances.present else SensorSettings()
-        has_integrals = self._resets.has_battery and self.config.follower.residual_on_pid
-        integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if has_integrals else None
         path = self._resets.goal_path(goal, rng)
         first = Goal(goal) if path == () else path.at(jnp.zeros(()))
-        loop, observation = self._loop_of(parameters).start(plant, first, load, sample, settings, integral)
+        loop, observation = self._loop_of(parameters).start(plant, first, load, sample, settings)
         world = PipelineState(
             loop=loop,
             load=load,
@@ -385,8 +382,6 @@ class TransportEnv:
         if self.config.motion.kind == "rolling":
             rate = world.plant.ball_rate
             parts += [loop.seen_by_followers(rate) if self._in_plane else rate[None]]
-        if self.config.follower.residual_on_pid:
-            parts += [world.loop.integral]
         if load.battery is not None:
             battery: Array = load.battery
             uncompensated: Array = load.uncompensated

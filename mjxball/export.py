@@ -114,7 +114,7 @@ def add_source(parser: Parser) -> None:
     about = "policy file, name of a shipped one, or run directory of train.py"
     parser.add_argument("source", metavar="POLICY|RUN", type=policy_path, help=about)
     plants = f"{', '.join(configs.PLANTS)}, or a rig in TOML, JSON, MJCF or URDF"
-    about = f"team in which a policy for any rig flies: {plants}"
+    about = f"plant to fly, for a policy for any rig or for two Crazyflies: {plants}"
     parser.add_argument("--plant", metavar="NAME|FILE", type=Path, help=about)
     parser.add_argument("--drone", metavar="N", type=int, help="its number in --plant where several drones follow")
 

@@ -22,8 +22,8 @@ SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(
 )
 # For each dash the followers in the order of COLOURS. Followers that often share a figure differ in colour too.
 TABLE = (
-    (SOLID, ("stand", "flight", "balance", "universal", "balance-sac", "flight-upgrade")),
-    (DASH_DOT_DOT, ("lost", "robust", "", "transport-large", "flight-brushless", "paper")),
+    (SOLID, ("stand", "flight", "balance", "universal", "balance-sac", "")),
+    (DASH_DOT_DOT, ("lost", "robust", "", "transport-large", "", "paper")),
     (DASH, ("", "", "", "lqg-calm", "lqg-disturbed", "lqg")),
     (DASH_DOT, ("mpc", "copy", "pid", "adaptive", "observer", "adaptive-mass")),
     (DOT, ("oracle", "", "", "", "random", "stay")),

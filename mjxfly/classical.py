@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from mjxball.arrays import Array
@@ -26,8 +25,6 @@ class ClassicalFollower:
             from mjxball.baselines import make_baseline
         except ModuleNotFoundError as missing:
             raise InputError(f"{name} needs {missing.name}; pip install 'mjxball[fly]'") from None
-        # Its command is complete: no integral is added to it.
-        config = replace(config, follower=replace(config.follower, residual_on_pid=False))
         self.name, self.metadata = name, flight_record(config)
         self.control_period = config.timing.control_period
         self._follower = make_baseline(name, config)

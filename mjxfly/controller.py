@@ -35,12 +35,12 @@ class FlightController:
 
     def reset(self) -> None:
         """Begin a flight: zero the integrals and what the follower remembers."""
-        self._integral = self._controllers.zero_integral(np.zeros(3))
+        self._integral = np.zeros(3)
         self.policy.reset()
 
     @property
     def integral(self) -> np.ndarray:
-        """Integrals of both controllers, see `sim.controllers.Controllers`."""
+        """Integral (3,) of the leader's error [m s]."""
         return self._integral
 
     def step(self, state: Body, goal: np.ndarray, goal_rate: np.ndarray | None = None) -> PairCommands:
@@ -53,8 +53,6 @@ class FlightController:
         observation, state = self._controllers.observe(state, goal, rate), relative_to_goal(state, rate)
         leader = self._controllers.leader_command(state, goal, self._integral)
         command = np.asarray(self.policy(rotations.turned_about_z(observation, -self._angle)), float)
-        follower = self._controllers.follower_command(rotations.turned_about_z(command, self._angle), self._integral)
-        self._integral = self._controllers.integrate(
-            self._integral, state, goal, self.period, follower_command=follower
-        )
+        follower = rotations.turned_about_z(command, self._angle)
+        self._integral = self._controllers.integrate(self._integral, state, goal, self.period)
         return PairCommands(leader, follower, observation, self.policy.hidden)

@@ -135,12 +135,11 @@ def crazyflies() -> Iterator[tuple[str, Numbers]]:
 
 def twin() -> Iterator[tuple[str, Numbers]]:
     found = measured("twin_hover")["rows"]
-    learned = {"2.1": "flight", "thrust-upgrade": "flight-upgrade", "brushless": "flight-brushless"}
+    followers = ("flight", "universal", "lqg", "lqg-calm", "lqg-disturbed")
     for drone, case in dict.fromkeys((row["drone"], row["case"]) for row in found):
-        names = (learned[drone], "universal", "lqg", "lqg-calm", "lqg-disturbed")
         line = case if drone == "2.1" else f"{drone.replace('-', ' ')}, {case}"
-        yield line, [1e3 * one(found, drone=drone, case=case, follower=name)["rms"] for name in names]
-    for name in ("flight", "universal", "lqg", "lqg-calm", "lqg-disturbed"):
+        yield line, [1e3 * one(found, drone=drone, case=case, follower=name)["rms"] for name in followers]
+    for name in followers:
         own = one(found, drone="2.1", case="as delivered", follower=name)
         numbers = [1e3 * own["largest"], 1e3 * own["sideways"], 1e3 * own["change"], own["touchdown"]]
         yield name, numbers
@@ -207,7 +206,7 @@ def agree(line: str, numbers: Numbers) -> bool:
     )
 
 
-@rows("policy", ("balance", "paper", "flight", "flight-upgrade", "flight-brushless", "stand", "universal", "lost"))
+@rows("policy", ("balance", "paper", "flight", "stand", "universal", "lost"))
 def test_what_was_flown_for_ten_minutes(policy: str) -> None:
     """Every number of millimetres is the largest error in a flight of this policy."""
     text = (REPOSITORY / "docs" / "followers.md").read_text()

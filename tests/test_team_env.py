@@ -295,7 +295,6 @@ def test_no_tilt_and_no_rotor_pushes_a_free_ball_towards_the_middle() -> None:
     [
         ({"scenario.team_sizes": (2, 8)}, "has 6"),
         ({"plant.cg_axis": "x", "scenario.cg_width": (0.0, 0.0)}, "in the plane"),
-        ({"follower.residual_on_pid": True}, "for a pair"),
         ({"follower.load_axis_only": True}, "along a line"),
     ],
 )

@@ -15,7 +15,7 @@ import numpy as np
 from mjxball.bench import frames
 from mjxball.bench.followers import entrant
 from mjxball.config import from_record
-from mjxball.control.followers import Baseline, PrivilegedInfo, residual_on_pid
+from mjxball.control.followers import Baseline, PrivilegedInfo
 from mjxball.errors import FOREIGN, InputError, said
 from mjxball.evaluate.followers import answered
 from mjxball.reading import parse_json
@@ -42,7 +42,7 @@ class Host:
             made = self._make(from_record(parse_json(content.decode())))
             refuse_privileged(made)
             self._made.append(Made(made, np.zeros(0)))
-            return frames.frame(frames.READY, bytes([residual_on_pid(made)]))
+            return frames.frame(frames.READY)
         (number,) = frames.NUMBER.unpack_from(content)
         own, values = self._made[number], frames.unpacked(content[frames.NUMBER.size :])
         if kind == frames.RESET:

@@ -59,7 +59,7 @@ def fly(parts: Sequence[Part]) -> list[Metrics]:
     running = begin(flown.start.position, goal.position, flown.start.rotor_force, leader, radii, deadlines)
     for number in range(len(flown.inputs.time)):
         inputs = flown.inputs.at(number)
-        carry, row = control_step(loop, controller, lambda *_: None, flown.load, carry, inputs, controller.on_pid)
+        carry, row = control_step(loop, controller, lambda *_: None, flown.load, carry, inputs)
         running = update(running, row, limit, most, leader)
     return results(running)
 

@@ -106,9 +106,9 @@ class FollowerProcess:
 
     def follower(self, config: Config) -> RemoteFollower:
         """The follower made for the nominal plant of `config`; RefusalError if it does not fly that plant."""
-        content = self.ask(frames.LOAD, json.dumps(to_dict(config)).encode(), frames.READY)
+        self.ask(frames.LOAD, json.dumps(to_dict(config)).encode(), frames.READY)
         self._made += 1
-        return RemoteFollower(self, self._made - 1, config, content == b"\x01")
+        return RemoteFollower(self, self._made - 1, config)
 
     def check_cpu_time(self, config: Config) -> float:
         """Median CPU time of a control step of one flight at rest [s]; InputError if it exceeds `MAX_CPU_TIME`."""
@@ -200,8 +200,8 @@ class RemoteFollower:
     Where the operating system counts coarsely, it is that of `cpu.CALLS` calls and of what the process does meanwhile.
     """
 
-    def __init__(self, process: FollowerProcess, number: int, config: Config, residual_on_pid: bool):
-        self.name, self.residual_on_pid, self._number = process.name, residual_on_pid, frames.NUMBER.pack(number)
+    def __init__(self, process: FollowerProcess, number: int, config: Config):
+        self.name, self._number = process.name, frames.NUMBER.pack(number)
         self.believed_mass: np.ndarray = np.zeros(0)
         self.slowest, self._calls, self._begun = 0.0, 0, (0.0, 0)
         self._process, self._limits = process, (config.command.tilt_limit, config.command.vertical_limit)

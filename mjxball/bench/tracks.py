@@ -32,6 +32,8 @@ MARGIN = 0.15  # trim margin of every load, see `plant.trim`
 SPEEDS = (0.2, 3.1)  # of the CG [rad/s]
 AMPLITUDES = (0.02, 0.17)  # of the pair's CG [m]
 MASSES, BELIEVED = (0.1, 0.6), 0.2  # of the pair's object [kg]
+# Of the Crazyflies' CG [rad/s], [m], object [kg] and goals [m]
+CRAZYFLIE_SPEEDS, CRAZYFLIE_AMPLITUDES, CRAZYFLIE_MASSES, CRAZYFLIE_GOALS = (0.2, 1.2), (0.0, 0.02), (0.015, 0.02), 0.5
 TEAMS = (3, 4, 5, 6)  # drones
 LOADS = (0.5, 1.5)  # mass of a team's object over that of its plant
 DIRECTIONS = tuple((math.cos(angle), math.sin(angle)) for angle in np.pi * np.arange(8) / 8)
@@ -202,14 +204,13 @@ def _crazyflie(draw: int) -> list[PlantFlights]:
 
 
 def _sample_crazyflie(config: Config, random: np.random.Generator, condition: str) -> Scenario | None:
-    ranges = config.scenario
     scenario = Scenario(
-        omega=float(random.uniform(*ranges.cg_speed)),
-        amplitude=float(random.uniform(*ranges.cg_amplitude)),
-        mass=float(random.uniform(*ranges.object_mass)),
+        omega=float(random.uniform(*CRAZYFLIE_SPEEDS)),
+        amplitude=float(random.uniform(*CRAZYFLIE_AMPLITUDES)),
+        mass=float(random.uniform(*CRAZYFLIE_MASSES)),
         believed_mass=config.plant.object_mass,
         phase=float(random.uniform(0, 2 * math.pi)),
-        goal=_goal(random, ranges.goal_range),
+        goal=_goal(random, CRAZYFLIE_GOALS),
         seconds=SECONDS,
     )
     scenario = _as_in(condition, scenario, config, random, CRAZYFLIE)

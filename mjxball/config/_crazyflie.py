@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mjxball.config._learning import Sac
+from mjxball.config._common import DISTURBED, LARGE_SAC, RECURRENT, RECURRENT_GRADIENT
 from mjxball.config._plant_file import read_plant
 from mjxball.config._scenario import ScenarioRanges
 from mjxball.config._settings import Bounds, Command, Config, Follower, Leader, Reward, Timing
@@ -21,24 +21,8 @@ PAIR = replace(
         ki=(0.2, 0.2, 1.5),
         integral_error_limit=(0.1, 0.1, 0.3),
         integral_lead_time=1.0,
-        tilt_integral_gain=10.0,
     ),
     command=Command(tilt_limit=0.26, vertical_limit=6.0),
-)
-
-
-# For a GPU.
-LARGE_SAC = Sac(
-    total_steps=2_560_000,
-    num_envs=512,
-    batch_size=512,
-    updates_per_step=16,
-    replay_size=512_000,
-    policy_layers=(128, 128),
-    critic_layers=(128, 128),
-    n_step=15,
-    learning_rate=2e-3,
-    learning_rate_final_ratio=0.02,
 )
 
 
@@ -89,43 +73,71 @@ def stand() -> Config:
 
 
 def flight() -> Config:
-    """The pair in free flight with a moving ball, the paper's future work."""
+    """The disturbed pair in free flight with a moving ball, the paper's future work."""
     return replace(
         PAIR,
         preset="flight",
         # About the other axis the leader's integral would compensate for the follower, until motors are at their limit.
-        follower=Follower(
+        follower=replace(
+            RECURRENT,
+            recurrent_units=56,
+            stale=True,
             load_axis_only=True,
-            action_scale_tilt=0.12,
-            action_scale_vertical=0.8,
-            observation_averages=(0.05, 0.2, 1.0),
-            residual_on_pid=True,
+            action_scale_tilt=0.2,
+            action_scale_vertical=1.5,
             privileged_critic=True,
         ),
-        scenario=ScenarioRanges(
+        scenario=replace(
+            ScenarioRanges(**DISTURBED),
             goal_range=0.5,
             start_velocity=0.1,
             start_tilt=0.05,
-            cg_speed=(0.2, 1.2),
+            cg_speed=(0.2, 1.6),
             cg_amplitude=(0.0, 0.02),  # the Crazyflie 2.1 has no thrust for more; see `plants/`
             object_mass=(0.015, 0.02),
             mass_known=False,
-            noise=(0.0, 0.5),
-            delay=(0.0, 0.05),
-            estimator_drift=(0.0, 3.0),
+            delay=(0.0, 0.07),
+            estimator_drift=(0.5, 2.0),
             quantize=True,
             leader_uses_measurements=True,
+            rotor_drag=(0.25, 0.45),
+            wind=(0.0, 0.3),
             gust=(0.0, 0.01),
-            rotor_lag_scale=(0.6, 2.0),
-            thrust_scale=(0.9, 1.1),
+            floor_clearance=(0.02, 1.0),
+            rotor_lag_scale=(0.7, 1.6),
+            thrust_scale=(0.93, 1.07),
             thrust_scale_common=(0.95, 1.05),
+            thrust_fade=(0.0, 0.002),
             battery=(3.2, 4.2),
-            uncompensated_probability=0.5,
-            inertia_scale=(0.6, 1.4),
+            uncompensated_probability=0.2,
+            inertia_scale=(0.8, 1.25),
             cg_waypoint_probability=0.3,
+            calm_probability=0.4,
             termination_distance=1.5,
         ),
-        reward=Reward(error_scale=0.02, velocity=8.0, steady_action=0.2),
         bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.2),
+        # Without a cost of effort the leader's integral and the network push against each other after minutes.
+        reward=Reward(
+            error=0.25,
+            error_scale=0.006,
+            velocity=8.0,
+            effort=0.1,
+            smoothness=0.2,
+            command_change=40.0,
+            rotor_limits=20.0,
+        ),
         sac=replace(LARGE_SAC, discount=0.985),
+        # For a GPU.
+        gradient=replace(
+            RECURRENT_GRADIENT,
+            gradient_steps=2000,
+            num_envs=1024,
+            policy_layers=(48,),
+            horizon=300,
+            windows_per_episode=(3, 8, 30),
+            learning_rate_final_ratio=0.01,
+            gradient_decay=0.996,
+            estimation=0.3,
+            exchanged_memory=0.25,
+        ),
     )

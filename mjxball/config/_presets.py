@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import types
 from dataclasses import replace
-from typing import Any
 
-from mjxball.config._crazyflie import LARGE_SAC, flight, stand
+from mjxball.config._common import DISTURBED, LARGE_SAC, RECURRENT, RECURRENT_GRADIENT
+from mjxball.config._crazyflie import flight, stand
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant_file import read_plant
 from mjxball.config._scenario import Rigs, ScenarioRanges
@@ -92,39 +92,6 @@ def _large() -> Config:
         reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
         sac=replace(LARGE_SAC, total_steps=2_048_000, discount=0.97, n_step=5, learning_rate=3e-3),
     )
-
-
-# A window may pass through a termination, so the gradient is limited in every environment.
-RECURRENT_GRADIENT = Gradient(
-    windows_per_episode=(3,),
-    learning_rate=6e-3,
-    learning_rate_final_ratio=0.003,
-    adam_betas=(0.9, 0.99),
-    gradient_decay=0.97,
-    state_gradient_clip=1e4,
-)
-# A recurrent network added to the PD controller, without averages of observations.
-RECURRENT = Follower(previous_action=True, recurrent_units=64)
-
-
-# Disturbed flights of mjxball-bench; delays beyond its range, so that its own are no ends.
-DISTURBED: dict[str, Any] = {
-    "noise": (0.5, 2.0),
-    "estimator_drift": (0.5, 1.5),
-    "offset": (1.0, 1.0),
-    "pose_lag": (0.0, 0.03),
-    "gap_rate": (0.0, 0.25),
-    "jitter": (0.0, 0.005),
-    "delay": (0.0, 0.075),
-    "thrust_scale": (0.95, 1.05),
-    "rotor_drag": (0.1, 0.5),
-    "wind": (0.0, 2.0),
-    "gust": (0.0, 0.1),
-    "floor_clearance": (0.06, 1.0),
-    "download": (0.0, 0.1),
-    "thrust_fade": (0.0, 0.001),
-    "calm_probability": 0.35,  # noise hides errors of millimetres
-}
 
 
 def _balance() -> Config:
@@ -348,7 +315,7 @@ PRESETS_ABOUT = {
 
 def algorithm_of(name: str) -> str:
     """The algorithm that trains the preset `name` unless another one is asked for."""
-    return "gradient" if name in ("quick", "balance", "team", "universal", "lost") else "sac"
+    return "gradient" if name in ("quick", "balance", "team", "universal", "lost", "flight") else "sac"
 
 
 def preset(name: str) -> Config:

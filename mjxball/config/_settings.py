@@ -80,13 +80,6 @@ class Leader:
         low=0,
         high=1000,
     )
-    tilt_integral_gain: float = setting(
-        0.0,
-        "difference of both drones' vertical acceleration per time integral of the carrier's tilt error about the axis "
-        "of the load's torque, with follower.residual_on_pid [m/s2 per rad s]",
-        low=0,
-        high=1e4,
-    )
     error: Literal["object", "own"] = setting(
         "object",
         "the error it controls: e_o of the object, or e_l of its own position, goal + its mount (paper's stand)",
@@ -110,11 +103,6 @@ class Follower:
     )
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", low=1e-9, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", low=1e-9, high=1e6)
-    residual_on_pid: bool = setting(
-        False,
-        "a residual action passes a high-pass filter and is added to the leader's PID controller with its integrals, "
-        "not to its PD part: the integrals make up for lasting loads",
-    )
     load_axis_only: bool = setting(
         False,
         "the network commands roll or pitch, whichever the load's torque turns; the other is the PD controller's or 0",

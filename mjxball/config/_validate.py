@@ -148,8 +148,6 @@ def _validate_plant(plant: Plant) -> None:
 def _validate_team(config: Config) -> None:
     """Settings that need a team, and those that need a pair."""
     plant, scenario = config.plant, config.scenario
-    if config.follower.residual_on_pid and plant.count > 2:
-        raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")
     if len(plant.directions) == 1 and scenario.cg_width[1] > 0:
         raise InputError("scenario.cg_width is for a load that moves in the plane: set plant.cg_axis to xy, or it to 0")
     if scenario.battery[1] > 0 and plant.count > 2:

@@ -66,7 +66,6 @@ class Follower(Protocol):
     """
 
     name: str
-    # A follower may also have `residual_on_pid`, see `residual_on_pid`.
 
     def reset(self) -> None:
         """Start an episode with a fresh state."""
@@ -76,15 +75,6 @@ class Follower(Protocol):
 
         Raises InputError for an invalid observation (`checked_observation`) and leaves the state as it was.
         """
-
-
-def residual_on_pid(follower: Any) -> bool:
-    """Whether the integrals of both drones' PID controller are added to the command of `follower`.
-
-    A follower or controller says so by an attribute of this name, as a policy trained with `follower.residual_on_pid`
-    does by its metadata. Without the attribute its command is complete.
-    """
-    return bool(getattr(follower, "residual_on_pid", False))
 
 
 def checked_observation(observation: Array) -> np.ndarray:
@@ -169,7 +159,6 @@ class Baseline:
 
     def __init__(self, controller: Controller, config: Config):
         self.controller, self.name = controller, controller.name
-        self.residual_on_pid = residual_on_pid(controller)
         self.privileged: PrivilegedInfo | None = None
         self._believed_mass = config.plant.object_mass
         self._state: Any = None

@@ -38,7 +38,6 @@ class UserFollower:
 
     def __init__(self, name: str, answer: Any):
         self.name, self._answer = name, answer
-        self.residual_on_pid = bool(_guarded(name, getattr, answer, "residual_on_pid", False))
 
     def reset(self) -> None:
         """See `Follower.reset`."""
@@ -56,7 +55,6 @@ class UserController:
     def __init__(self, name: str, controller: Any):
         self.name, self._controller = name, controller
         self.needs_privileged = bool(_guarded(name, getattr, controller, "needs_privileged", False))
-        self.residual_on_pid = bool(_guarded(name, getattr, controller, "residual_on_pid", False))
 
     def start(self, observation: Any) -> Any:
         """See `Controller.start`."""

@@ -42,7 +42,7 @@ MAX_UNITS = 512
 MAX_NUMBER = 1e6  # size of any number in the metadata and of any weight; larger ones would overflow
 FOLDER = "policies"  # shipped policies
 ARCHIVE = "archive"  # in FOLDER: earlier policies that documents name
-READ_OF_CONFIG = ("leader", "attitude", "reward")  # sections of the configuration that evaluation reads
+READ_OF_CONFIG = ("leader", "follower", "attitude", "reward")  # sections of the configuration that evaluation reads
 MAX_METADATA = 2**20  # characters
 # Metrics with bounds in the metadata; of each smaller values are better.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
@@ -102,13 +102,6 @@ def observing_stale(policy: PolicyFile) -> PolicyFile:
         metadata={**policy.metadata, "stale": True},
         gru=policy.gru and (np.insert(policy.gru[0], place, 0.0, axis=0), *policy.gru[1:]),
     )
-
-
-def residual_on_pid(metadata: dict[str, Any]) -> bool:
-    """Whether a policy with `metadata` was trained with `follower.residual_on_pid`; the first files do not say."""
-    config = metadata.get("config")
-    follower = config.get("follower") if isinstance(config, dict) else None
-    return isinstance(follower, dict) and follower.get("residual_on_pid") is True
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
@@ -288,6 +281,8 @@ def _metadata_faults(metadata: dict[str, Any]) -> Iterator[str]:
     config = metadata.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
         yield "metadata field config is not a configuration"
+    if config.get("follower", {}).get("residual_on_pid") is True:
+        yield "it adds to the leader's PID controller with its integrals, which this version no longer does"
     if type(metadata.get("stale", False)) is not bool:
         yield "metadata field stale must be true or false"
     yield from _number_faults(metadata)

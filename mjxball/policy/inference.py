@@ -16,7 +16,7 @@ from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
 from mjxball.control.network_interface import NetworkInterface
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, interface_of, load_file, policy_name, residual_on_pid
+from mjxball.policy.file import PolicyFile, interface_of, load_file, policy_name
 
 ROUNDED = 1e-5  # tolerance for a GRU's state beyond 1, from rounding
 
@@ -53,7 +53,6 @@ class Policy:
         self.name = name
         self.metadata = metadata
         self.control_period = float(metadata["control_period"])
-        self.residual_on_pid = residual_on_pid(metadata)
         self._dtype = np.dtype(dtype)
         half = layout.ACTION_SIZE
         weights = [*contents.weights[:-1], contents.weights[-1][:, :half]]
@@ -196,7 +195,7 @@ class NetworkController:
     needs_privileged = False
 
     def __init__(self, policy: Policy):
-        self.name, self.residual_on_pid = policy.name, policy.residual_on_pid
+        self.name = policy.name
         self._network = policy._network
         self._interface = policy._interface
         self._geometry = policy._geometry

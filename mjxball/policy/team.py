@@ -1,4 +1,4 @@
-"""Policies for any rig, adapted to one: their metadata then hold its plant, configuration and geometry."""
+"""Policies adapted to another plant: their metadata then hold its configuration, and its geometry if they take one."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ def is_for_any(metadata: dict[str, Any]) -> bool:
 
 
 def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | None = None) -> PolicyFile:
-    """`policy` adapted to the follower `drone` of the team of `config`; unchanged if it takes no geometry.
+    """`policy` adapted to the follower `drone` of the team of `config`.
 
-    Its metadata then have `team`, and the plant and configuration of that team. Raises InputError if `config` or
-    `drone` do not fit.
+    Its metadata then have the plant and configuration of that team, and `team` if it takes geometry. Others fly any
+    pair of Crazyflies that is joined and held as the one of their training. Raises InputError if `config` or `drone`
+    do not fit.
     """
     if not interface_of(policy.metadata).geometry:
-        if config is not None or drone is not None:
-            raise InputError(f"{name} knows nothing of its team: leave --plant and --drone out")
-        return policy
+        if drone is not None or (config is not None and not _joined_alike(config, policy.metadata)):
+            raise InputError(f"{name} is for the plant that it was trained on: leave --plant and --drone out")
+        return policy if config is None else _on(config, policy)
     if config is None and drone is None and "team" in policy.metadata:
         return policy
     followers: tuple[int, ...] = (1,) if config is None else config.plant.followers
@@ -47,17 +48,29 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
         "mount_angle": float(np.ravel(mount_frames(config.plant))[index]),
         "context": np.atleast_2d(geometry_of(config.plant))[index].tolist(),
     }
-    return replace(policy, metadata={**policy.metadata, **_metadata_of(config, policy.metadata), "team": team})
+    return _on(config, policy, team=team)
 
 
-def _metadata_of(config: Config, metadata: dict[str, Any]) -> dict[str, Any]:
-    """Metadata fields for plant and configuration of the policy with `metadata` on the plant of `config`.
+def _joined_alike(config: Config, metadata: dict[str, Any]) -> bool:
+    """Whether `config` and the plant of training are pairs of Crazyflies alike in axis, stand and leader."""
+    pairs = config, _trained(metadata)
+    if any(one.autopilot.kind != "crazyflie" or one.plant.count != 2 for one in pairs):
+        return False
+    flown, trained = ((one.plant.cg_axis, one.plant.stand, one.plant.leader) for one in pairs)
+    return flown == trained
 
-    Preset, controllers and control period are those of training.
-    """
-    trained = configs.from_record({"plant": {}, **metadata.get("config", {})})
+
+def _trained(metadata: dict[str, Any]) -> Config:
+    """The configuration of the training of a policy with `metadata`."""
+    return configs.from_record({"plant": {}, **metadata.get("config", {})})
+
+
+def _on(config: Config, policy: PolicyFile, **more: Any) -> PolicyFile:
+    """`policy` with metadata for the plant of `config` and `more`; controllers and period are those of its training."""
+    trained = _trained(policy.metadata)
     timing = replace(trained.timing, physics_steps=round(trained.timing.control_period / config.physics_step))
     kept = {name: getattr(trained, name) for name in ("preset", "leader", "command", "follower")}
     flown = configs.validate(replace(config, **kept, timing=timing))
     drones = {"firmware": firmware(config)} if config.autopilot.kind == "crazyflie" else {}
-    return {"plant": configs.to_dict(config.plant), "config": configs.to_dict(flown), **drones}
+    plant = {"plant": configs.to_dict(config.plant), "config": configs.to_dict(flown), **drones}
+    return replace(policy, metadata={**policy.metadata, **plant, **more})

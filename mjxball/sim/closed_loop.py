@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
     from mjxball.arrays import Array
-    from mjxball.physics.engine import Load, PlantState, Scalar, Vector
+    from mjxball.physics.engine import Load, PlantState, Vector
     from mjxball.physics.step import PlantStep
     from mjxball.plant import PlantParameters
-    from mjxball.sim.controllers import Integral, Observation
+    from mjxball.sim.controllers import Observation
     from mjxball.sim.goals import Goal
     from mjxball.sim.sensors import Sample, SensorModel
 
@@ -38,7 +38,7 @@ class LoopState(NamedTuple):
     """State of the closed loop between control steps, any batch shape."""
 
     plant: PlantState
-    integral: Integral
+    integral: Vector
     sensors: Any  # `SensorState`; () without sensor errors
     diverged: Bool[Array, "..."]  # where true, `plant` no longer changes
     commands: Any = ()  # (..., N, 3) of all drones in the last period; () unless commands come late
@@ -68,9 +68,8 @@ class ClosedLoop(Controllers):
         load: Load,
         sample: Sample,
         settings: SensorSettings = EXACT,
-        integral: Integral | None = None,
     ) -> tuple[LoopState, Observation]:
-        """(state, observation) before the first step, with the plant in state `plant`; `integral` None: zero.
+        """(state, observation) before the first step, with the plant in state `plant`.
 
         `goal` of O; `settings` of the sensors.
         """
@@ -79,10 +78,9 @@ class ClosedLoop(Controllers):
         if self._sensors.present:
             sensors, measured = self._sensors.start(self._measurable(truth), sample, settings)
             truth = self._observed(measured, goal)
-        integral = self.zero_integral(plant.position) if integral is None else integral
         xp, batch = plant.position.__array_namespace__(), plant.position.shape[:-1]
         commands = xp.zeros((*batch, self._count, 3), dtype=plant.position.dtype) if self._jitters else ()
-        return LoopState(plant, integral, sensors, has_diverged(plant), commands), truth
+        return LoopState(plant, xp.zeros_like(plant.position), sensors, has_diverged(plant), commands), truth
 
     def step(
         self,
@@ -92,18 +90,17 @@ class ClosedLoop(Controllers):
         load: Load,
         goals: tuple[Goal, Goal],
         sample: Sample,
-        on_pid: Scalar | float = 1.0,
         plant_step: PlantStep | None = None,
     ) -> tuple[LoopState, Observation, TeamCommands]:
         """One control period: (state, observation at its end, commands).
 
         `follower` is the followers' answer to `observation`, in their mount frames. `goals` are those of O at the
         beginning and the end of the period. `load` includes the external force during the period; `sample` disturbs the
-        measurement at its end. `on_pid` (...) is 1 for a network to whose command the integral terms are added
-        (`follower.residual_on_pid`), 0 for a follower whose command is complete. `plant_step` replaces the loop's own.
+        measurement at its end. `plant_step` replaces the loop's own.
         """
         leader_sees, goal = self._leader_body(state, observation, goals[0]), goals[0].position
-        commands = self._commands(leader_sees, state.integral, follower, goal, on_pid)
+        leads = self.leader_command(leader_sees, goal, state.integral)
+        commands = TeamCommands(leads, self.in_body_axes(follower))
         sent = self.stack(*commands)
         if load.late is not None:
             load = load._replace(last_commands=state.commands)
@@ -111,8 +108,7 @@ class ClosedLoop(Controllers):
         diverged = state.diverged | has_diverged(plant)
         if not (isinstance(diverged, np.ndarray | np.generic) and not diverged.any()):
             plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
-        on_pid = np.asarray(on_pid)[..., None]
-        integral = self.integrate(state.integral, leader_sees, goal, self.period, on_pid, commands.follower)
+        integral = self.integrate(state.integral, leader_sees, goal, self.period)
         sensors, truth = state.sensors, self._truth(plant, goals[1], load)
         if self._sensors.present:
             sensors, measured = self._sensors.step(sensors, self._measurable(truth), sample)
@@ -137,18 +133,6 @@ class ClosedLoop(Controllers):
 
     def _observed(self, measured: Array, goal: Goal) -> Observation:
         return measured if self._sensors.object_sensor else self.observe_by(measured, goal.position, goal.rate)
-
-    def _commands(
-        self, leader_sees: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
-    ) -> TeamCommands:
-        leader_command = self.leader_command(leader_sees, goal, integral)
-        follower = self.in_body_axes(follower)
-        if not self._on_pid:
-            return TeamCommands(leader_command, follower)
-        xp, on_pid = leader_command.__array_namespace__(), np.asarray(on_pid)
-        return TeamCommands(
-            leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, integral), follower)
-        )
 
     def _leader_body(self, state: LoopState, observation: Observation, goal: Goal) -> Body:
         """The body by its measurements, or the true one if `scenario.leader_uses_measurements` is off.

@@ -1,4 +1,4 @@
-"""Controllers of all drones, which simulation and flight call alike: the leader's PID, shared integrals, stands.
+"""Controllers of all drones, which simulation and flight call alike: the leader's PID, observations, stands.
 
 Importing it needs NumPy alone.
 """
@@ -22,13 +22,9 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Vector
 
     Observation = Float[Array, "... 18"]
-    Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID controller
 
-# Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
-MAX_LIFT_DIFFERENCE = 1.5
 ATTITUDE, RATES = slice(3, 6), slice(9, 12)  # slots of an observation
 ROLLS = (1.0, 0.0, 0.0)  # what a stand leaves of an attitude
-WASHOUT_TIME = 8.0  # time constant of the high pass on what a network adds to both drones' PID controller [s]
 
 
 class BodyState(NamedTuple):
@@ -77,23 +73,11 @@ class Controllers:
 
     On a stand, where a drone's estimator invents motion along what is locked, neither controller is fed it: position
     and velocity across, pitch, yaw and their rates are 0.
-
-    `integral` (..., 3) of the leader's error [m s] is followed by that of the stick's angle error [rad s] where the
-    residual is on the PID controller: two drones with integrals of their own wind up against each other, for only the
-    whole lift and the whole moment show in the motion. The leader's PID is then both drones' base, and what keeps
-    turning the stick is lifted away, one drone more, the other less, instead of being held by a lasting roll command.
-    Behind them stands the average (..., 3) of what the network adds to that base (`WASHOUT_TIME`): it is taken
-    off, for a lasting command of one drone is undone by the other's integrals and only costs both of them range.
     """
 
     def __init__(self, config: Config, parameters: PlantParameters | None = None):
         self._leader_settings, self._gravity = config.leader, config.plant.gravity
         self._limits = config.command.tilt_limit, config.command.vertical_limit
-        self._on_pid = config.follower.residual_on_pid
-        self._tilt_integral_gain = config.leader.tilt_integral_gain
-        self._axis = 0 if config.plant.cg_axis == "y" else 1  # roll or pitch, which the load turns
-        # A leader at +y that lifts more rolls the stick up, one at +x pitches it down.
-        self._lift_sign = (1.0, -1.0)[self._axis]
         # On a pivot height stays: a drone's own follows from roll, and flies on that.
         self._free = None if config.plant.stand == "free" else (0.0, 0.0, 1.0)
         self._follower_sees = config.follower.error
@@ -231,76 +215,20 @@ class Controllers:
         error, rate = self._leader_place_error(state, goal)
         return self._along_free_axes(error), self._along_free_axes(rate)
 
-    def zero_integral(self, position: Vector) -> Integral:
-        """The integral before a flight that begins at `position`."""
-        xp = position.__array_namespace__()
-        still = xp.zeros_like(position)
-        return xp.concat([still, still[..., :1], still], axis=-1) if self._on_pid else still
-
-    def integrate(
-        self,
-        integral: Integral,
-        state: Body,
-        goal: Vector,
-        period: float,
-        on_pid: Float[Array, "... 1"] | None = None,
-        follower_command: Vector | None = None,
-    ) -> Integral:
-        """`integral` one `period` [s] on, in which its error was that at `state`.
-
-        `on_pid`, if given: 1 where the follower flies on it too, 0 where its command is complete.
-        `follower_command`: what a network's follower flew, in body axes.
-        """
+    def integrate(self, integral: Vector, state: Body, goal: Vector, period: float) -> Vector:
+        """`integral` (..., 3) [m s] of the leader's error one `period` [s] on, in which it was that at `state`."""
         xp = goal.__array_namespace__()
         band = xp.asarray(self._leader_settings.integral_error_limit, dtype=goal.dtype)
         error, rate = self.leader_error(state, goal)
         lead = self._leader_settings.integral_lead_time
         error = error + lead * rate if lead else error
-        own = integral[..., :3] + period * clipped(error, -band, band)
-        if not self._on_pid:
-            return own
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        axis = slice(self._axis, self._axis + 1)
-        off = self._pid_command(state, goal, integral)[..., axis] - euler[..., axis]
-        most = MAX_LIFT_DIFFERENCE / self._tilt_integral_gain if self._tilt_integral_gain else 0.0
-        level = clipped(integral[..., 3:4] + period * off, -most, most)
-        average = integral[..., 4:]
-        if follower_command is not None:
-            # What was added is what was flown above the base, which is the leader's controller, and what was taken off.
-            base = self._with_lift_difference(self._pid_command(state, goal, integral), integral, -self._lift_sign)
-            average = average + period / WASHOUT_TIME * (follower_command - base)
-        if on_pid is not None:
-            level, average = level * on_pid, average * on_pid
-        return xp.concat([own, level, average], axis=-1)
+        return integral + period * clipped(error, -band, band)
 
-    def leader_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
-        """The leader's command at `state`; `integral` of its error so far, see `Controllers`."""
-        wanted = self._pid_command(state, goal, integral)
-        return wanted if not self._on_pid else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
-
-    def follower_command(self, command: Vector, integral: Integral) -> Vector:
-        """A network's `command` in body axes, which includes the PD controller's, with its share of integrals."""
-        if not self._on_pid:
-            return command
-        xp, controller = command.__array_namespace__(), self._leader_settings
-        ki = xp.asarray(controller.ki, dtype=command.dtype)
-        more = leader.command(ki * integral[..., :3], 0.0, self._gravity, *self._limits)
-        return self._clip(self._with_lift_difference(command + more - integral[..., 4:], integral, -self._lift_sign))
-
-    def _pid_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
+    def leader_command(self, state: Body, goal: Vector, integral: Vector) -> Vector:
+        """The leader's command at `state`; `integral` (..., 3) of its error so far."""
         error, rate = self.leader_error(state, goal)
         gains = self._leader_settings.kp, self._leader_settings.kd, self._leader_settings.ki
-        return leader.pid_command(error, rate, integral[..., :3], gains, self._gravity, *self._limits)
-
-    def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:
-        """`command` with what this drone lifts more than the other to turn the stick."""
-        xp = command.__array_namespace__()
-        return xp.concat(
-            [command[..., :2], command[..., 2:] + side * self._tilt_integral_gain * integral[..., 3:4]], axis=-1
-        )
-
-    def _clip(self, command: Vector) -> Vector:
-        return leader.clip_command(command, *self._limits)
+        return leader.pid_command(error, rate, integral, gains, self._gravity, *self._limits)
 
     def _along_free_axes(self, vector: Vector) -> Vector:
         """`vector` in the world without what the stand locks."""

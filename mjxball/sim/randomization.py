@@ -77,8 +77,6 @@ class ResetDistribution:
         self._table = rigs.training_rigs(config) if config.rigs.number and scenario.team_sizes else None
         self._constants = constants = plant_parameters(config.plant, config.attitude)
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
-        self._lever = 2 * min(map(abs, constants.mounts[:, plant.directions[0]]))
-        self._integrates = config.follower.residual_on_pid and config.leader.tilt_integral_gain > 0
         self._loses = scenario.lost_follower_probability + scenario.lost_leader_probability > 0
         self._loss_amplitudes = teams.amplitudes_with_loss(config) if self._loses else None
         self._drones = constants.own_inertia.sum(axis=0)
@@ -351,11 +349,10 @@ class ResetDistribution:
         return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _battery_trim_limit(self, load: Load, mass: Scalar) -> Scalar:
-        """As `trimmed`, for drones with batteries: rotor torque, and the moment of unequal lifts of both drones."""
+        """As `trimmed`, for drones with batteries, of which the weaker one holds the load."""
         plant = self.config.plant
         weakest = 1.0 if load.thrust_scale is None else jnp.minimum(load.thrust_scale[0], load.thrust_scale[1])
-        apart = LIFT * (sum(drone.mass for drone in plant.drones) + mass) * self._lever if self._integrates else 0.0
-        return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
+        return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest))
 
     def sample_battery_and_thrust(
         self, load: Load, key: Array, count: int = CANDIDATES
@@ -408,24 +405,6 @@ class ResetDistribution:
         plain = motors.OLDER if motors.compensates(curve) else curve
         asked = jnp.where(uncompensated[:, None] > 0, crazyflie.motor_force(plain, pwm), force)
         return 4 * asked / believed - gravity
-
-    def initial_integrals(self, load: Load, key: Array) -> Float[Array, "7"]:
-        """Integrals (7,) (see `Controllers`) of an environment that starts in the air, 0.6 to 1.1 of hover."""
-        leader = self.config.leader
-        battery: Scalar = load.battery
-        uncompensated: Scalar = load.uncompensated
-        scale: Array = load.thrust_scale
-        command = self.hover_commands(load.object_mass, battery[None], uncompensated[None], scale[None])[0]
-        share = jax.random.uniform(key, (2,), minval=0.6, maxval=1.1)
-        side = 1.0 if self.config.plant.cg_axis == "y" else -1.0
-        height = share[0] * (command[0] + command[1]) / 2 / leader.ki[2] if leader.ki[2] > 0 else 0.0
-        level = (
-            share[1] * side * (command[0] - command[1]) / 2 / leader.tilt_integral_gain
-            if leader.tilt_integral_gain > 0
-            else 0.0
-        )
-        initial_integrals = jnp.zeros(7)
-        return initial_integrals.at[2].set(height).at[3].set(level)
 
     def _with_battery(self, load: Load, key: Array) -> Load:
         """`load` with the first sampled battery, firmware and thrusts that can fly, or nominal drones if none can."""

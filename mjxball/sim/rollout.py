@@ -11,7 +11,7 @@ import numpy as np
 from mjxball.arrays import joined
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
-from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command, residual_on_pid
+from mjxball.control.followers import Baseline, Controller, Follower, PrivilegedInfo, checked_command
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import aerodynamics, newton_euler
@@ -79,19 +79,17 @@ def control_step(
     load: Load,
     carry: Carry,
     inputs: Inputs,
-    on_pid: Array | float = 1.0,
 ) -> tuple[Carry, Trajectory]:
     """One control period of n flights, on NumPy or JAX arrays: (what goes on, the row of its beginning).
 
-    The followers' `controller` sees `carry.observation` and, from `privileged`, what it may know of plant and `load`;
-    `on_pid` as of `ClosedLoop.step`.
+    The followers' `controller` sees `carry.observation` and, from `privileged`, what it may know of plant and `load`.
     """
     state, seen, plant = carry.loop, carry.observation, carry.loop.plant
     acting = load._replace(external_force=inputs.force, late=inputs.late)
     goals = inputs.goal, inputs.next_goal
     known = privileged(plant, acting, _goal_acceleration(goals, loop.period))
     memory, answer = controller.step(carry.follower, seen, known)
-    moved, observation, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, on_pid)
+    moved, observation, commands = loop.step(state, seen, answer, acting, goals, inputs.sample)
     row = Trajectory.of(plant, inputs.time, inputs.goal.position, commands, diverged=state.diverged, observation=seen)
     return Carry(moved, observation, memory), row
 
@@ -165,7 +163,7 @@ def simulate_batch(
     validate(config)
     controller = Together(flights)
     flown = scenario_arrays(config, [scenario for _, part in flights for scenario in part])
-    on_pid, load, inputs = controller.on_pid, flown.load, flown.inputs
+    load, inputs = flown.load, flown.inputs
     privileged = make_privileged_info(config) if controller.needs_privileged else lambda *_: None
     plant_step = make_numpy_plant_step(config, physics)
     loop = ClosedLoop(config, plant_step, flown.sensors, jitters=inputs.late is not None)
@@ -174,7 +172,7 @@ def simulate_batch(
     for number in range(len(inputs.time)):
         progress(number / len(inputs.time))
         plants.append(carry.loop.plant)
-        carry, row = control_step(loop, controller, privileged, load, carry, inputs.at(number), on_pid)
+        carry, row = control_step(loop, controller, privileged, load, carry, inputs.at(number))
         rows.append(row)
     plant = plants[0].each(lambda *leaves: np.stack(leaves), *plants[1:])
     flight = Trajectory(*(None if part[0] is None else np.stack(part) for part in zip(*rows, strict=True)))
@@ -206,8 +204,6 @@ class Together:
                 )
             follower.reset()
         self.needs_privileged = any(isinstance(follower, Baseline) for follower, _ in flights)
-        # As each follower itself says: what class it is of does not matter.
-        self.on_pid = np.array([float(residual_on_pid(follower)) for follower, part in flights for _ in part])
 
     def start(self, observation: np.ndarray) -> tuple[()]:
         """Nothing: the followers remember themselves."""

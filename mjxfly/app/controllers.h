@@ -156,6 +156,7 @@ static void command_of(const float *acceleration, float *command) {
     clip_command(command);
 }
 
+#if !MJXBALL_FOLLOWER
 static void leader_error(const pair_state *pair, const float *goal, float *error, float *rate) {
     float arm[3], sweep[3];
     arm_of(pair, mjxball_rig.mount[0], arm, sweep);
@@ -175,62 +176,33 @@ static void pid(const float *error, const float *rate, const float *integral, fl
         acceleration[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
     command_of(acceleration, command);
 }
-
-/* Bound of the leader's integral of the stick's angle [rad s]. */
-static float tilt_integral_limit(void) {
-    return mjxball_rig.tilt_gain > 0 ? MAX_LIFT_DIFFERENCE / mjxball_rig.tilt_gain : 0;
-}
-
-/* Additional vertical acceleration of this drone that rotates the stick [m/s2]. */
-static float lift(const float *integral) {
-    float side = MJXBALL_FOLLOWER ? -mjxball_rig.lift_sign : mjxball_rig.lift_sign;
-    return side * mjxball_rig.tilt_gain * integral[3];
-}
+#endif
 
 /* One period of this drone's controller: sets `app->command`. False if the network's output is not finite. */
 static bool compute_command(mjxball_app *app, const pair_state *pair, const float *goal) {
     const float period = (float)mjxball_rig.period / 1000;
-    float error[3], rate[3], base[3], *command = app->command, *integral = app->integral;
+    float *command = app->command;
     bool good = true;
-    leader_error(pair, goal, error, rate);
-    if (MJXBALL_FOLLOWER)
-        for (int i = 0; i < 4; i++) integral[i] = app->peer.integral[i];
-    pid(error, rate, integral, base);
 #if MJXBALL_FOLLOWER
-    {
-        float observation[18], more[3], integrated[3];
-        observe(pair, goal, observation);
+    float observation[18];
+    (void)period;
+    observe(pair, goal, observation);
 #ifdef MJXBALL_MOUNT_ANGLE
-        turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
+    turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
 #endif
-        if (!app->copying) good = !mjxball_follow(&app->follower, observation, app->action, command);
-        if (app->copying || !good) mjxball_copy_command(observation, command);
+    if (!app->copying) good = !mjxball_follow(&app->follower, observation, app->action, command);
+    if (app->copying || !good) mjxball_copy_command(observation, command);
 #ifdef MJXBALL_MOUNT_ANGLE
-        turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
+    turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
 #endif
-        if (mjxball_rig.shares) {
-            for (int i = 0; i < 3; i++) integrated[i] = mjxball_rig.ki[i] * integral[i];
-            command_of(integrated, more);
-            for (int i = 0; i < 3; i++) command[i] += more[i] - integral[4 + i];
-            command[2] += lift(integral);
-            clip_command(command);
-            base[2] += lift(integral);
-            for (int i = 0; i < 3; i++) integral[4 + i] += period / WASHOUT_TIME * (command[i] - base[i]);
-        }
-    }
 #else
-    for (int i = 0; i < 3; i++) command[i] = base[i];
-    if (mjxball_rig.shares) {
-        float most = tilt_integral_limit();
-        command[2] += lift(integral);
-        clip_command(command);
-        integral[3] = clip(integral[3] + period * (base[mjxball_rig.axis] - pair->euler[mjxball_rig.axis]),
-            -most, most);
-    }
+    float error[3], rate[3];
+    leader_error(pair, goal, error, rate);
+    pid(error, rate, app->integral, command);
     for (int i = 0; i < 3; i++) {
         float ahead = error[i] + mjxball_rig.lead * rate[i];
         ahead = clip(ahead, -mjxball_rig.band[i], mjxball_rig.band[i]);
-        integral[i] = clip(integral[i] + period * ahead, -MOST_INTEGRAL, MOST_INTEGRAL);
+        app->integral[i] = clip(app->integral[i] + period * ahead, -MOST_INTEGRAL, MOST_INTEGRAL);
     }
 #endif
     return good;

@@ -116,7 +116,7 @@ static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_
         app->trusted = 1;
         app->late = 0;
     } else if (phase == MJXBALL_FLY) {
-        for (int i = 0; i < 7; i++) app->integral[i] = 0;
+        for (int i = 0; i < 3; i++) app->integral[i] = 0;
         app->saturated_since = app->now;
 #if MJXBALL_FOLLOWER
         mjxball_reset(&app->follower);
@@ -285,7 +285,7 @@ static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint 
     if (app->phase < MJXBALL_DESCEND) enter(app, MJXBALL_DESCEND, MJXBALL_BAD_COMMAND, map);
     app->trusted = 0;
     app->peer_time = 0; /* until it is heard again */
-    for (int i = 0; i < 7; i++) app->integral[i] = 0; /* the other drone receives finite values only */
+    for (int i = 0; i < 3; i++) app->integral[i] = 0;
     if (!within(app->velocity, 3, MOST_SPEED)) app->velocity[0] = app->velocity[1] = app->velocity[2] = 0;
     app->trim = hover_of(app, map);
     if (!within(&app->climb, 1, MOST_SPEED)) app->climb = 0;

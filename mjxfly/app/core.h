@@ -73,10 +73,7 @@ typedef struct {
     float mount_frame[2];  /* cosine and sine of the angle about body z by which the policy's axes are rotated */
 #endif
     float carried[2];      /* nominal mass that each drone lifts [kg] */
-    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain; /* the leader's controller, see sim/controllers.py */
-    int axis;              /* of the load's moment: 0 roll, 1 pitch */
-    float lift_sign;       /* sign of the rotation about the axis if the leader lifts more */
-    int shares;            /* the follower adds to the leader's PID, whose integrals it receives */
+    float kp[3], kd[3], ki[3], band[3], lead; /* the leader's controller, see sim/controllers.py */
     int stand;             /* only height and roll are free */
     int own_error;         /* the leader's error is that of its mount, not of O */
     int paper;             /* 1: thrust by the paper's map, 0: by the force curve */
@@ -110,14 +107,13 @@ typedef struct {
     float thrust;             /* [thrust units] */
 } mjxball_setpoint;
 
-#define MJXBALL_BEAT_SIZE 40
+#define MJXBALL_BEAT_SIZE 24
 #define MJXBALL_REPLY_SIZE 8
 
 /* Heartbeat of the other drone. */
 typedef struct {
     uint32_t key;
     uint8_t phase, trusted;
-    float integral[4]; /* of the leader: position error [m s], error of the stick's angle [rad s] */
     float velocity[3]; /* of O [m/s] */
     float apart;       /* half difference of the drones' lifts that its take-off found [hover] */
 } mjxball_beat;
@@ -132,7 +128,7 @@ typedef struct {
     mjxball_parameters set; /* in use */
     float origin[3], land_height;
     float position[3], velocity[3]; /* of O */
-    float integral[7];
+    float integral[3]; /* of the leader's error [m s] */
     float trim;       /* hover thrust [thrust units] */
     float climb, height; /* model of a descent without estimates */
     float share, apart, resting; /* of the take-off: mean lift, half difference [hover], angle at rest [rad] */

@@ -17,7 +17,6 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import APP, c_header, float_bytes, footprint, weight_bytes
-from mjxball.sim import controllers
 from mjxfly import flight, policy_setup, setpoints, takeoff
 from mjxfly.app.protocol import CAUSES
 from mjxfly.setpoints import CURVE_NAMES
@@ -45,7 +44,6 @@ SAME = (
 )
 # Constants of the laptop's flight that the C files use by their names here, `rig.h` defines them.
 SHARED = {
-    controllers: ("MAX_LIFT_DIFFERENCE", "WASHOUT_TIME"),
     setpoints: ("NEAR_GROUND", "BRAKE_TILT"),
     flight: ("LIFTED",),
     takeoff: (
@@ -93,11 +91,10 @@ def check_policy(policy: PolicyFile, name: str) -> Config:
 
 def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
     """Return `rig.h`: parameters of both controllers and of the supervisor, and a sentence for each `CAUSES`."""
-    leader, plant, stand = config.leader, config.plant, config.plant.stand != "free"
+    leader, stand = config.leader, config.plant.stand != "free"
     goal, rig = policy_setup.goal_of(config), Rig.of_plant(config.plant)
     bounds = policy_setup.limits_of(config, goal)
     variants = policy_setup.variants(config)
-    axis = 0 if plant.cg_axis == "y" else 1
     angle = policy_setup.mount_angle(policy.metadata)
     first = next(iter(variants[0]))
     fields: dict[str, Any] = {
@@ -112,10 +109,6 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "ki": leader.ki,
         "band": leader.integral_error_limit,
         "lead": leader.integral_lead_time,
-        "tilt_gain": leader.tilt_integral_gain,
-        "axis": axis,
-        "lift_sign": (1.0, -1.0)[axis],
-        "shares": int(config.follower.residual_on_pid),
         "stand": int(stand),
         "own_error": int(leader.error != "object"),
         "paper": int(config.autopilot.thrust_law == "paper"),

@@ -174,8 +174,8 @@ class App:
 
     @property
     def integral(self) -> Sequence[float]:
-        """(7,) integrals of the controllers, see `sim.controllers.Controllers`."""
-        return list(self._c.integral(self._core)[:7])
+        """(3,) integral of the leader's error [m s]."""
+        return list(self._c.integral(self._core)[:3])
 
     @property
     def ident(self) -> int:

@@ -19,9 +19,8 @@ void mjxball_send(const mjxball_app *app, uint8_t out[MJXBALL_BEAT_SIZE]) {
     out[2] = app->phase;
     out[3] = app->trusted;
     copy(out + 4, &mjxball_rig.key, 4);
-    copy(out + 8, app->integral, 16);
-    copy(out + 24, app->velocity, 12);
-    copy(out + 36, &app->apart, 4);
+    copy(out + 8, app->velocity, 12);
+    copy(out + 20, &app->apart, 4);
 }
 
 void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now) {
@@ -32,10 +31,8 @@ void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now)
     beat.trusted = data[3];
     copy(&beat.key, data + 4, 4);
     if (app->phase != MJXBALL_IDLE && beat.key != mjxball_rig.key) return; /* of another pair */
-    copy(beat.integral, data + 8, 16);
-    copy(beat.velocity, data + 24, 12);
-    copy(&beat.apart, data + 36, 4);
-    if (!within(beat.integral, 3, MOST_INTEGRAL) || !within(beat.integral + 3, 1, tilt_integral_limit())) return;
+    copy(beat.velocity, data + 8, 12);
+    copy(&beat.apart, data + 20, 4);
     if (!within(beat.velocity, 3, MOST_SPEED) || !within(&beat.apart, 1, APART)) return;
     app->peer = beat;
     app->peer_time = now ? now : 1;

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from mjxfly.packets import Packet
 
 PORT, CHANNEL = 13, 2  # the firmware's channel for apps
-BEAT_SIZE, REPLY_SIZE = 40, 8
+BEAT_SIZE, REPLY_SIZE = 24, 8
 CHUNK = 24  # bytes of weights in a packet
 GROUP = "mjxb"
 CONTROLLER, PID, OUT_OF_TREE = "stabilizer.controller", 1, 6  # only an out-of-tree controller is given the state

@@ -34,7 +34,6 @@ FLIGHT = apply_overrides(
         "command.vertical_limit": 3.0,
         "follower.action_scale_tilt": 0.2,
         "follower.action_scale_vertical": 3.0,
-        "follower.residual_on_pid": False,
         "scenario.leader_uses_measurements": False,
     },
 )

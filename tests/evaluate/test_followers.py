@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import REPOSITORY
 
-from mjxball.baselines import Stay, make_baseline
+from mjxball.baselines import Stay
 from mjxball.config import preset
-from mjxball.control.followers import Baseline, Follower
+from mjxball.control.followers import Baseline
 from mjxball.errors import InputError
 from mjxball.evaluate.followers import follower_factory
-from mjxball.policy import Policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -52,40 +50,6 @@ def test_what_it_raises_has_a_line_and_a_shape(own: None) -> None:
     said = r"IndexError: .*, in own_followers.py line 13, given observations of shape \(2, 18\)"
     with pytest.raises(InputError, match=said):
         follower(np.zeros((2, 18)))
-
-
-class Wrapped:
-    """Any follower behind a class of its own, as a user's would be; it says nothing about integrals."""
-
-    def __init__(self, follower: Follower):
-        self.name, self._follower = "wrapped", follower
-
-    def reset(self) -> None:
-        self._follower.reset()
-
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        return self._follower(observation)
-
-
-class Declared(Wrapped):
-    residual_on_pid = True
-
-
-def test_shared_integrals_are_added_to_what_says_so_whatever_its_class() -> None:
-    """On Crazyflies, three seconds with a load that turns the stick: commands as the plant gets them."""
-    config, path = preset("flight"), REPOSITORY / "policies" / "flight.npz"
-    scenario = Scenario(omega=0.0, phase=1.57, amplitude=0.01, seconds=3.0)
-
-    def commands(follower: Follower) -> np.ndarray:
-        return simulate(config, follower, scenario, "newton-euler").follower_command
-
-    residual, complete = commands(Policy.load(path)), commands(Wrapped(Policy.load(path)))
-    np.testing.assert_array_equal(commands(Declared(Policy.load(path))), residual)
-    # A controller computes in float64.
-    np.testing.assert_allclose(commands(Baseline(Policy.load(path).controller, config)), residual, atol=1e-4)
-    assert np.abs(complete - residual).max() > 0.01
-    copied = commands(make_baseline("copy", config))
-    np.testing.assert_array_equal(commands(Wrapped(make_baseline("copy", config))), copied)
 
 
 def test_a_controller_that_hides_that_it_needs_the_true_cg_gets_zeros() -> None:

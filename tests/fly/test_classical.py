@@ -14,6 +14,7 @@ from mjxball.baselines import make_baseline
 from mjxball.cli import plant_setup
 from mjxball.config import preset
 from mjxball.errors import InputError
+from mjxball.export import in_team
 from mjxball.policy import load_file, shipped_policy
 from mjxfly import main as flying
 from mjxfly.classical import NAMES, ClassicalFollower, classical, is_classical
@@ -48,12 +49,10 @@ def test_it_commands_what_the_baseline_does_in_simulation(name: str) -> None:
 def test_its_metadata_are_those_of_a_policy_for_the_plant(plant: str) -> None:
     """Apart from the network's own, and the integrals that are not added."""
     found = classical("lqg", Path(plant)).metadata
-    shipped = {"crazyflie": "flight", "crazyflie-thrust-upgrade": "flight-upgrade"}.get(plant, "flight-brushless")
-    policy = load_file(shipped_policy(shipped)).metadata
+    policy = in_team(load_file(shipped_policy("flight")), "flight", Path(plant)).metadata
     for field in ("command_limits", "leader_kp", "leader_kd", "gravity", "control_period", "preset"):
         assert found[field] == policy[field]
     assert json.loads(json.dumps(found["plant"]["drones"])) == policy["plant"]["drones"]
-    assert not found["config"]["follower"]["residual_on_pid"]
 
 
 def test_lqg_hovers_on_the_twin() -> None:

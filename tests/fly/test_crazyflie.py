@@ -83,17 +83,10 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
     error = commands.observation[14] + lead * commands.observation[17]
     integrated = world.flight.controller._integral[2] - world.flight.controller.period * error  # before it
     lift = config.leader.kp[2] * commands.observation[14] + config.leader.kd[2] * commands.observation[17]
-    apart = (
-        config.leader.tilt_integral_gain * world.flight.controller._integral[3]
-        if config.follower.residual_on_pid
-        else 0.0
-    )
-    assert (abs(commands.leader[2] - apart - lift - config.leader.ki[2] * integrated) > 1e-3) == own
-    # What lifts apart has moved on by one tick. The network says nothing:
-    # the follower's command is the PD controller on what it observes, or the leader's own.
+    assert (abs(commands.leader[2] - lift - config.leader.ki[2] * integrated) > 1e-3) == own
+    # The network says nothing: the follower's command is the PD controller on what it observes.
     limit = config.command.vertical_limit
-    base = commands.leader[2] - 2 * apart if config.follower.residual_on_pid else np.clip(lift, -limit, limit)
-    assert commands.follower[2] == pytest.approx(base, abs=5e-3 if apart else 1e-5)
+    assert commands.follower[2] == pytest.approx(np.clip(lift, -limit, limit), abs=1e-5)
 
 
 @given(st.sampled_from(PRESETS), tilt, tilt, vertical)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tables import weekly
 
 from mjxball.control.rotations import roll_of_quaternion
+from mjxball.export import in_team
 from mjxball.policy import Policy
-from mjxball.policy.file import shipped_policy
+from mjxball.policy.file import load_file, shipped_policy
 from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings, Limits
 from mjxfly.packets import FLYING, LOCKED
@@ -196,10 +198,11 @@ def test_delay_is_borne() -> None:
 
 @pytest.mark.slow
 def test_other_drones_have_gains_for_their_own_firmware_alone() -> None:
-    for name, drone in (("flight-upgrade", "thrust-upgrade"), ("flight-brushless", "brushless")):
-        policy = Policy.load(shipped_policy(name))
+    for drone in ("thrust-upgrade", "brushless"):
+        other = in_team(load_file(shipped_policy("flight")), "flight", Path(f"crazyflie-{drone}"))
+        policy = Policy(other, "flight")
         world = VirtualTwin(policy, FlightSettings(2.0), kind=DRONES[drone], settle=1.0)
         assert [list(own) for own in world.variants] == [["linear"], ["linear"]]
         world.run(60.0)
-        assert world.flight.supervisor.cause is None, (name, world.flight.supervisor)
+        assert world.flight.supervisor.cause is None, (drone, world.flight.supervisor)
         assert world.flight.lifted

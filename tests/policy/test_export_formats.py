@@ -18,13 +18,15 @@ from onboard_bench import needs_gcc
 from tables import weekly
 
 from mjxball import __version__
-from mjxball.cli import plant_setup
+from mjxball.cli import apply_plant, plant_setup
+from mjxball.config import preset
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.file import interface_of, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 from mjxball.policy.quantize import balanced, rows_of
+from mjxfly.policy_setup import config_of
 from onboard import recurrent as recurrent_flight
 
 STEPS = 60
@@ -269,6 +271,22 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         np.testing.assert_array_equal(load_file(out).weights[0], load_file(saved).weights[0])
 
 
+@pytest.mark.parametrize("plant", ["crazyflie-thrust-upgrade", "crazyflie-brushless"])
+def test_a_policy_of_two_crazyflies_flies_others(plant: str, tmp_path: Path):
+    """Its weights and controllers stay; plant, gains and force curve are those of the other drones."""
+    out, before = tmp_path / "other.npz", load_file(shipped_policy("flight"))
+    assert main(["flight", str(out), "--plant", plant]) == 0
+    after, wanted = load_file(out), apply_plant(preset("flight"), Path(plant))
+    for one, other in zip(after.weights, before.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    flown = config_of(after.metadata)
+    assert (flown.plant, flown.autopilot) == (wanted.plant, wanted.autopilot)
+    trained = config_of(before.metadata)
+    assert (flown.leader, flown.command, flown.follower) == (trained.leader, trained.command, trained.follower)
+    assert after.metadata["firmware"]["drone"] == plant.removeprefix("crazyflie-")
+    assert after.metadata["command"] == before.metadata["command"]
+
+
 @pytest.mark.parametrize(
     ("source", "out", "message"),
     [
@@ -279,7 +297,10 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("none.npz", "follower.h", "none.npz does not exist"),
         ("broken.npz", "follower.onnx", "broken.npz: metadata field history is missing"),
         ("no-run", "follower.onnx", "no-run"),
-        ("follower.npz", "a.h --plant team4", "knows nothing of its team"),
+        ("follower.npz", "a.h --plant team4", "is for the plant that it was trained on"),
+        ("flight", "a.npz --plant stand", "is for the plant that it was trained on"),
+        ("flight", "a.npz --plant crazyflie --drone 1", "is for the plant that it was trained on"),
+        ("balance", "a.npz --plant crazyflie", "is for the plant that it was trained on"),
         ("universal.npz", "a.h", "must know its team: --plant NAME"),
         ("universal.npz", "a.onnx --plant team4", "--drone must be a follower of --plant: 1, 2, 3"),
         ("universal.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),

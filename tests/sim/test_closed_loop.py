@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from tables import rows
 
-from mjxball.config import PRESETS, Config, apply_overrides, preset
+from mjxball.config import Config, apply_overrides, preset
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.sim.controllers import MAX_LIFT_DIFFERENCE, WASHOUT_TIME, BodyState, Controllers
+from mjxball.sim.controllers import BodyState, Controllers
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -32,65 +32,10 @@ def body(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), euler=(0.0, 0.0, 0.
 
 def started(config: Config) -> tuple[Controllers, np.ndarray]:
     loop = Controllers(config)
-    return loop, loop.zero_integral(np.zeros(3))
+    return loop, np.zeros(3)
 
 
-class TestSharedIntegrals:
-    def test_both_drones_are_told_the_leaders_whole_law(self) -> None:
-        """A network that adds nothing: what the leader is told is what the follower is told, whatever has wound up."""
-        config = apply_overrides(preset("flight"), {"leader.tilt_integral_gain": 0.0})
-        loop, integral = started(config)
-        integral = integral + np.array([0.1, -0.2, 0.3, 0.0, 0.0, 0.0, 0.0])
-        state, goal = body((0.1, -0.1, 0.05), (0.02, 0.0, 0.01)), np.zeros(3)
-        pd = loop.leader_command(state, goal, np.zeros(7))
-        leader_command = loop.leader_command(state, goal, integral)
-        follower_command = loop.follower_command(pd, integral)
-        np.testing.assert_allclose(follower_command, leader_command, atol=1e-12)
-        assert np.abs(leader_command - pd).max() > 0.01
-
-    def test_a_stick_that_hangs_is_lifted_apart(self) -> None:
-        """Rolled against what is asked, the drone that hangs lifts more and the other less by the same amount."""
-        loop, integral = started(preset("flight"))
-        hanging, goal = body(euler=(-0.02, 0.0, 0.0)), np.zeros(3)  # the leader, at +y, is low
-        for _ in range(50):
-            integral = loop.integrate(integral, hanging, goal, PERIOD)
-        leader_command = loop.leader_command(hanging, goal, integral)[2]
-        follower_command = loop.follower_command(np.zeros(3), integral)[2]
-        gain = preset("flight").leader.tilt_integral_gain
-        assert leader_command == pytest.approx(gain * 0.02 * 0.5, rel=1e-6)
-        assert follower_command == pytest.approx(-leader_command, rel=1e-6)
-
-    def test_lift_apart_has_a_limit(self) -> None:
-        loop, integral = started(preset("flight"))
-        for _ in range(5000):
-            integral = loop.integrate(integral, body(euler=(-0.3, 0.0, 0.0)), np.zeros(3), PERIOD)
-        assert loop.leader_command(body(), np.zeros(3), integral)[2] == pytest.approx(MAX_LIFT_DIFFERENCE, rel=1e-6)
-
-    def test_what_a_network_adds_for_ever_is_washed_out(self) -> None:
-        """5 degrees of lasting roll command: e^-1 of it is left after the time constant, 2 % after four."""
-        loop, integral = started(preset("flight"))
-        state, goal, added = body(), np.zeros(3), np.array([math.radians(5), 0.0, 0.0])
-        for share in (1, 3):
-            for _ in range(round(share * WASHOUT_TIME / PERIOD)):
-                follower_command = loop.follower_command(added, integral)
-                integral = loop.integrate(integral, state, goal, PERIOD, follower_command=follower_command)
-            left = loop.follower_command(added, integral)[0] / added[0]
-            # The washed out command itself is followed by the level integral's asked roll of 0.
-            assert left == pytest.approx(math.exp(-1) if share == 1 else math.exp(-4), rel=0.02)
-
-    def test_a_follower_with_a_law_of_its_own_shares_nothing(self) -> None:
-        loop, integral = started(preset("flight"))
-        state = body(euler=(-0.02, 0.0, 0.0))
-        alone = loop.integrate(integral, state, np.zeros(3), PERIOD, np.zeros(1), np.ones(3))
-        assert not alone[3:].any()
-
-    def test_presets_of_the_1_kg_plant_keep_three_integrals_and_their_commands(self) -> None:
-        for name in ("transport", "balance", "paper"):
-            loop, integral = started(PRESETS[name])
-            assert integral.shape == (3,)
-            command = np.array([0.1, 0.2, 0.3])
-            assert loop.follower_command(command, integral) is command
-
+class TestIntegral:
     def test_height_does_not_wind_up_on_a_way_at_the_pace_that_the_lead_foresees(self) -> None:
         """The error is integrated with its rate: on e' = -e / lead nothing is."""
         config = preset("flight")

@@ -147,13 +147,12 @@ def test_a_state_from_the_future_is_none():
     assert bench.cause(0) == OLD
 
 
-# Of a heartbeat: bytes 0 to 3 M, role, phase, trusted; key; integrals (4), velocity (3) and position (2) as floats.
+# Of a heartbeat: bytes 0 to 3 M, role, phase, trusted; key; velocity (3) and result of the take-off as floats.
 BEATS: tuple[tuple[str, Callable[[bytearray], None]], ...] = (
-    *((f"integral {k}", lambda beat, k=k: struct.pack_into("<f", beat, 8 + 4 * k, 2000.0)) for k in range(4)),
-    *((f"velocity {k}", lambda beat, k=k: struct.pack_into("<f", beat, 24 + 4 * k, -60.0)) for k in range(3)),
+    *((f"velocity {k}", lambda beat, k=k: struct.pack_into("<f", beat, 8 + 4 * k, -60.0)) for k in range(3)),
     *(
         (f"{value} at {at}", lambda beat, at=at, value=value: struct.pack_into("<f", beat, at, value))
-        for at in range(8, 36, 4)
+        for at in range(8, 24, 4)
         for value in WILD
     ),
     ("phase", lambda beat: beat.__setitem__(2, 7)),

@@ -87,7 +87,7 @@ int file_write(int file, const void *from, unsigned size);
 int main(void) {
     static mjxball_app app;
     static struct { mjxball_state state; uint8_t beat[MJXBALL_BEAT_SIZE]; uint32_t now, order; } in;
-    static struct { float setpoint[3], command[3], integral[7]; uint8_t beat[MJXBALL_BEAT_SIZE]; } out;
+    static struct { float setpoint[3], command[3], integral[3]; uint8_t beat[MJXBALL_BEAT_SIZE]; } out;
     int from = file_open("in.bin", 0), to = file_open("out.bin", 1);
     mjxball_parameters set;
     mjxball_defaults(&set);
@@ -102,7 +102,7 @@ int main(void) {
         mjxball_send(&app, out.beat);
         out.setpoint[0] = wanted.roll, out.setpoint[1] = wanted.pitch, out.setpoint[2] = wanted.thrust;
         for (int i = 0; i < 3; i++) out.command[i] = app.command[i];
-        for (int i = 0; i < 7; i++) out.integral[i] = app.integral[i];
+        for (int i = 0; i < 3; i++) out.integral[i] = app.integral[i];
         file_write(to, &out, sizeof out);
     }
     return 0;
@@ -142,5 +142,5 @@ def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
     for number in range(2):
         benchmark.build(tmp_path, REPLAY, [*generate.options(False), f"-DMJXBALL_FOLLOWER={number}"])
         host, arm = benchmark.on_both(tmp_path, b"".join(records[number]))
-        assert len(host) == 900 * (13 * 4 + protocol.BEAT_SIZE)
+        assert len(host) == 900 * (9 * 4 + protocol.BEAT_SIZE)
         assert host == arm

@@ -11,7 +11,7 @@ TICKS = 200_000
 FAULTS = (
     ("checks.h", "if (!fault) app->set = *asked;", "app->set = *asked;", (0, 1)),
     ("checks.h", "within(state->velocity, 3, MOST_SPEED)", "true", (0, 1)),
-    ("packets.h", "if (!within(beat.integral, 3, MOST_INTEGRAL) || ", "if (", (0, 1)),
+    ("packets.h", "!within(beat.velocity, 3, MOST_SPEED)", "false", (0, 1)),
     ("packets.h", "at + count > app->upload.size", "false", (1,)),
     ("packets.h", "if (!weights_are_good(memory)) return MJXBALL_BAD_UPLOAD;", "(void)weights_are_good;", (1,)),
     ("packets.h", "if (app->phase != MJXBALL_IDLE) return MJXBALL_NOT_ON_GROUND;", "", (1,)),
