@@ -157,7 +157,7 @@ def closed_loop(
         state = LoopState(plant, jnp.zeros_like(still), late, jnp.zeros((), bool))
         carry = rollout.Carry(state, loop.observe_by(past[-1], goal), memory)
         inputs = rollout.Inputs(zero, Goal(goal), Goal(goal), None, None, Sample())
-        (moved, _, memory), _ = rollout.control_step(loop, controller, privileged, load, carry, inputs, 0.0)
+        (moved, _, memory), _ = rollout.control_step(loop, controller, privileged, load, carry, inputs)
         older = moved.sensors.past[1:] if delay else older
         # A flight that diverged stays where it was, which is no hover.
         return jnp.where(moved.diverged, jnp.nan, flat(moved.plant, memory, older)[0])

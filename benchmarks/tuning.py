@@ -184,7 +184,7 @@ class Flown:
 
             def advance(carried: Any, now: Inputs) -> tuple[Any, None]:
                 carry, (last, limited, peak), number = carried
-                carry, row = control_step(loop, controller, privileged, load, carry, now, np.float32(0.0))
+                carry, row = control_step(loop, controller, privileged, load, carry, now)
                 far = jnp.sqrt(((row.target - row.position) ** 2).sum(axis=-1))
                 inside = (far <= jnp.asarray(part.bounds, jnp.float32)) & ~row.diverged
                 near = near_limit(AT_LIMIT_WITHIN, row.rotor_force, most[..., None]).max(axis=(-2, -1))
