@@ -21,9 +21,10 @@ import numpy as np
 from harness import Row, arguments, say, table, write
 from mjxball.control.crazyflie import FULL
 from mjxball.export import in_team
-from mjxball.policy import Policy, policy_path
+from mjxball.policy import Policy, PolicyFile, policy_path
 from mjxball.policy.file import load_file, save_file
 from mjxball.running import run_command
+from mjxfly.app.host import compile_pair
 from mjxfly.classical import NAMES as CLASSICAL
 from mjxfly.classical import ClassicalFollower
 from mjxfly.controller import FlightController
@@ -43,6 +44,7 @@ CASES = {
     "thrust -8/+8 %": Surroundings(gains=(0.92, 1.08)),
     "thrust -5/-5 %": Surroundings(gains=(0.95, 0.95)),
 }
+LONGER = {f"{1e3 * delay:.0f} ms each way": Surroundings(delay=delay) for delay in (0.02, 0.04)}  # only if asked for
 DRONES = {  # plant of each of the twin's drones
     "2.1": "crazyflie",
     "thrust-upgrade": "crazyflie-thrust-upgrade",
@@ -52,13 +54,18 @@ FOLLOWERS = ("flight", "universal", *CLASSICAL)
 WORST = ("rms", "largest", "sideways", "tilt", "limit", "change", "touchdown")
 
 
-def flown(case: str, follower: str, plant: str, seed: int) -> Row:
-    """One flight."""
+def flown(case: str, follower: str, plant: str, seed: int, onboard: str = "") -> Row:
+    """One flight; `onboard`: weights (float32, int8) of controllers on the drones."""
     one = of_pair(follower, plant)
     config = FlightController(one).config
-    surroundings = replace(CASES[case], seed=seed)
-    settings = FlightSettings(seconds=SECONDS, goal=goal_of(config))
-    world = VirtualTwin(one, settings, kind=drone_kind(drone_of(config)), surroundings=surroundings, settle=SETTLE)
+    world = VirtualTwin(
+        one,
+        settings := FlightSettings(seconds=SECONDS, goal=goal_of(config)),
+        kind=drone_kind(drone_of(config)),
+        surroundings=replace((CASES | LONGER)[case], seed=seed),
+        settle=SETTLE,
+        cores=compile_pair(pair_file(follower, plant), "follower", onboard == "int8") if onboard else None,
+    )
     end = world.run()
     flying = [moment for moment in world.track if moment.state == "fly"]
     if not flying:
@@ -69,7 +76,7 @@ def flown(case: str, follower: str, plant: str, seed: int) -> Row:
     errors = np.array([np.linalg.norm(moment.position - goal) for moment in late])
     early = np.array([moment.position[:2] for moment in world.track if moment.time <= begun + SETTLED])
     ticks = [record for record in world.log.records if record["kind"] == "tick" and record["state"] == "fly"]
-    rolls = np.radians([record["sent"][1].roll for record in ticks if record["t"] > begun + SETTLED])
+    rolls = np.radians([record["sent"][1].roll for record in ticks if record["t"] > begun + SETTLED and not onboard])
     pwm = np.array([moment.pwm for moment in late])
     return {
         "end": end if len(flying) * settings.period > SECONDS - 1 else "not all flown",
@@ -78,7 +85,8 @@ def flown(case: str, follower: str, plant: str, seed: int) -> Row:
         "sideways": float(np.hypot(*early.T).max()),  # [m]
         "tilt": float(max(moment.tilt for moment in late)),  # [rad]
         "limit": float((pwm >= FULL).mean(axis=0).max()),  # share of the time of the motor that is longest at one
-        "change": float(np.sqrt((np.diff(rolls) ** 2).mean())),  # of the follower's roll from step to step [rad]
+        # Of the follower's roll from step to step [rad]; on the drones it is not recorded.
+        "change": 0.0 if onboard else float(np.sqrt((np.diff(rolls) ** 2).mean())),
         "touchdown": world.touchdown_speed(),  # [m/s]
     }
 
@@ -90,8 +98,14 @@ def of_pair(follower: str, plant: str) -> Policy | ClassicalFollower:
         return load_follower(path, Path(plant))
     with tempfile.TemporaryDirectory() as folder:
         exported = Path(folder) / path.name
-        save_file(exported, in_team(load_file(path), path.stem, Path(plant)))
+        save_file(exported, pair_file(follower, plant))
         return load_follower(exported)
+
+
+def pair_file(follower: str, plant: str) -> PolicyFile:
+    """The policy, for the pair of `plant`."""
+    path = policy_path(follower)
+    return in_team(load_file(path), path.stem, Path(plant))
 
 
 def main(given: Sequence[str] | None = None) -> int:
@@ -99,7 +113,10 @@ def main(given: Sequence[str] | None = None) -> int:
     parser = arguments(__file__, __doc__ or "")
     parser.add_argument("--drones", nargs="+", choices=DRONES, default=list(DRONES), help="kinds (all)")
     parser.add_argument("--followers", nargs="+", default=FOLLOWERS, help="policies and classical ones (all shipped)")
-    parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="conditions (all)")
+    parser.add_argument(
+        "--cases", nargs="+", choices=tuple(CASES | LONGER), default=list(CASES), help="conditions (all)"
+    )
+    parser.add_argument("--onboard", choices=("float32", "int8"), default="", help="controllers' weights on the drones")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="flights of each (2)")
     options = parser.parse_args(given)
@@ -111,7 +128,11 @@ def main(given: Sequence[str] | None = None) -> int:
     ]
     rows: list[Row] = []
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
-        flights = {(*one, seed): pool.submit(flown, *one[1:], seed) for one in cases for seed in range(options.seeds)}
+        flights = {
+            (*one, seed): pool.submit(flown, *one[1:], seed, options.onboard)
+            for one in cases
+            for seed in range(options.seeds)
+        }
         for one in cases:
             found = [flights[*one, seed].result() for seed in range(options.seeds)]
             ends = ", ".join(sorted({flight["end"] for flight in found}))

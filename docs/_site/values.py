@@ -171,7 +171,6 @@ NAMES: dict[str, Any] = {
     "silent": [row for row in results("fly_faults_virtual")["faults"] if row["fault"] == "silent-up"],
     "twin": SimpleNamespace(
         nearer=delivered["flight"]["rms"] / delivered["lqg"]["rms"],
-        calmer=delivered["flight"]["change"] / delivered["lqg"]["change"],
         crashes={row["follower"]: row["crashes"] for row in results("crazyflie")["flight"]},
     ),
     "kept": {row["follower"]: row["kept"] * row["starts"] for row in results("crazyflie")["stand"]},

@@ -74,6 +74,7 @@ class Progress:
         self._doing = "", "", KEYS
         self._latest: tuple[Row, float] | None = None  # the newest row and its time [s]
         self.before = 0.0  # time that the run took before it was resumed [s]
+        self.ends: float | None = None  # of a run by the clock: when it ends, a monotonic time [s]
         self._silent, self._log = path is None, tracker
         if path is None:
             return
@@ -143,11 +144,16 @@ class Progress:
         return [[*self._speed(row, time.monotonic() - came), steps, self._called], [KEYS, *self._summary(row)]]
 
     def _speed(self, row: Row, since: float) -> list[str]:
-        """Share of the steps done, time left, and steps per second; `since` the row [s]."""
-        left = max(self.total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
+        """Share of the steps or of the time done, time left, and steps per second; `since` the row [s]."""
+        if self.ends is None:
+            share = min(row["steps"] / self.total, 1.0)
+            left = max(self.total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
+        else:
+            left = max(self.ends - time.monotonic(), 0.0)
+            share = 1.0 - left / max(row["seconds"] + since + left, 1e-9)
         minutes, seconds = divmod(max(int(left), 0), 60)
         return [
-            f"{min(row['steps'] / self.total, 1.0):.0%}",
+            f"{share:.0%}",
             f"{minutes}:{seconds:02d} left",
             f"{row['rate'] / 1e3:.1f} k/s",
         ]

@@ -139,7 +139,7 @@ class Run:
         sessions = [session(self.population.member_config(k), seed + k, 1, origin) for k in range(count)]
         minutes: float | None = origin.get("minutes")
         begun = time.monotonic() if began is None else began
-        self._ends = None if minutes is None else begun + 60 * minutes - self.progress.before
+        self._ends = self.progress.ends = None if minutes is None else begun + 60 * minutes - self.progress.before
         self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
         self.on_traced: Callable[[], None] | None = None  # is called when XLA compiles, which leaves Python free
         self.on_evaluated: Callable[[Path], None] | None = None  # is called with the policy file after an evaluation

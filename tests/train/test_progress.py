@@ -6,6 +6,7 @@ import contextlib
 import csv
 import io
 import struct
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -106,6 +107,18 @@ def test_a_value_that_is_none_has_no_point(tmp_path: Path, caplog: pytest.LogCap
     }
     assert not caplog.records
     assert read_rows(tmp_path / METRICS)[0]["eval_peak"] == "nan"
+
+
+def test_a_run_by_the_clock_shows_the_time_that_is_left(tmp_path: Path) -> None:
+    """Whatever its first steps took and however many are planned: they are planned anew at every row."""
+    shown = io.StringIO()
+    progress = Progress(tmp_path / METRICS, NAMES, 10**9, stream=shown)
+    progress.ends = time.monotonic() + 60.5
+    for steps in (100, 200):
+        progress.show(row(steps) | {"seconds": 30.0, "rate": 1.0})
+        progress.total = 300
+    progress.close()
+    assert shown.getvalue().count("33%  1:00 left") == 2
 
 
 def test_a_run_is_called_after_preset_and_seed_and_names_its_hyperparameters(tmp_path: Path) -> None:
