@@ -210,7 +210,8 @@ def agree(line: str, numbers: Numbers) -> bool:
 def test_what_was_flown_for_ten_minutes(policy: str) -> None:
     """Every number of millimetres is the largest error in a flight of this policy."""
     text = (REPOSITORY / "docs" / "followers.md").read_text()
-    (row,) = re.findall(rf"^\| `{policy}` \| (.*?) \|", text.partition("steady for ten minutes")[2], flags=re.MULTILINE)
+    table = text.partition("steady for ten minutes")[2].partition("\n\n")[0]
+    (row,) = re.findall(rf"^\| `{policy}` \| (.*?) \|", table, flags=re.MULTILINE)
     own = [row for row in measured("horizon")["rows"] if row["policy"] == policy]
     peaks = [1e3 * max(row[f"{axis}_peak"] or 0.0 for axis in "xyz") for row in own]
     shown = re.findall(r"(?:from )?([\d.]+)(?: to ([\d.]+))? mm", row)
