@@ -40,7 +40,10 @@ def load_follower(path: Path, plant: Path | None = None) -> Policy | ClassicalFo
     if is_classical(path):
         return classical(str(path), plant)
     if plant is not None:
-        raise InputError(f"--plant is for {', '.join(CLASSICAL)}: a policy flies the plant in its metadata")
+        names = ", ".join(CLASSICAL)
+        raise InputError(
+            f"--plant is for {names}: a policy flies the plant in its metadata (see mjxball.export --plant)"
+        )
     return Policy(load_policy(path), policy_name(path))
 
 
