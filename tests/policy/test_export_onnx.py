@@ -81,7 +81,7 @@ def test_an_observation_that_cannot_be_leaves_no_trace(name: str):
             np.testing.assert_array_equal(found["next_memory"][2::2, row], found["next_memory"][1:-1:2, row])
 
 
-@rows("name", ("recurrent", "paper", "flight", "balance-sac", "universal"))  # none of which observes it
+@rows("name", ("recurrent", "paper", "stand", "balance-sac"))  # none of which observes it
 def test_a_repeated_measurement_is_noticed_as_by_policy(name: str, recurrent: Recurrent):
     """Each row by itself: of two flights one has repeats, and an observation that cannot be before each."""
     plain = recurrent.contents if name == "recurrent" else contents_of(name)
@@ -127,7 +127,7 @@ def test_a_memory_that_cannot_be_is_forgotten(name: str):
 
 
 def test_the_bound_is_numpys_and_a_network_without_an_answer_says_so():
-    contents = contents_of("flight")
+    contents = contents_of("stand")
     model, start = Model(contents), np.ones((1, 1), bool)
     for size, good in ((5.5e4, True), (5.6e4, False)):  # 18 of them below and above 1e6
         found: dict[str, Any] = model.answer(np.full((1, 18), size), np.zeros((1, model.size)), start)

@@ -186,7 +186,7 @@ def test_a_policy_with_the_input_of_stale_commands_the_same_until_it_is_trained(
     """With a GRU, and without one; in a file, of whose metadata a reader that does not know the field refuses it."""
     random = np.random.default_rng(6)
     seen, _ = with_repeats(random.normal(scale=0.3, size=(40, 18)).astype(np.float32))
-    for contents in (recurrent.contents, *(load_file(shipped_policy(name)) for name in ("flight", "paper"))):
+    for contents in (recurrent.contents, *(load_file(shipped_policy(name)) for name in ("stand", "paper"))):
         added = observing_stale(contents)
         assert interface_of(added.metadata).input_size == interface_of(contents.metadata).input_size + 1
         assert observing_stale(added) is added
