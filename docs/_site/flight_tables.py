@@ -112,7 +112,7 @@ def parameters() -> str:
 def loads() -> str:
     """What each shipped policy for two Crazyflies carries on the twin."""
     lines = ["| policy | object [g] | CG on the twin |", "|---|---|---|"]
-    for name in ("flight", "flight-upgrade", "flight-brushless", "stand"):
+    for name in ("flight", "stand"):
         config = config_of(Policy.load(shipped_policy(name)).metadata)
         met = Conditions.of(config)
         moves = f"a sine of {1000 * met.cg_amplitude:.0f} mm at {met.cg_speed:g} rad/s"
