@@ -1,8 +1,9 @@
 """Hover of two Crazyflies on the software twin: learned and classical followers in the same conditions.
 
 `python -m mjxfly FOLLOWER --rehearse` in virtual time (`virtual_twin.py`): take-off, 20 s at 0.4 m, landing. The load
-moves by 1 cm at 0.9 rad/s, in the middle of the preset's range. Errors of O are those from 5 s after both controllers took over; sideways is its largest
-horizontal distance from the start before that. Of every number the worst of the seeds is kept.
+moves by 1 cm at 0.9 rad/s, in the middle of the preset's range. Errors of O are those from 5 s after both controllers
+took over; sideways is its largest horizontal distance from the start before that. Of every number the worst of the
+seeds is kept.
 """
 
 from __future__ import annotations
