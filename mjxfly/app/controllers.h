@@ -180,12 +180,10 @@ static void pid(const float *error, const float *rate, const float *integral, fl
 
 /* One period of this drone's controller: sets `app->command`. False if the network's output is not finite. */
 static bool compute_command(mjxball_app *app, const pair_state *pair, const float *goal) {
-    const float period = (float)mjxball_rig.period / 1000;
     float *command = app->command;
     bool good = true;
 #if MJXBALL_FOLLOWER
     float observation[18];
-    (void)period;
     observe(pair, goal, observation);
 #ifdef MJXBALL_MOUNT_ANGLE
     turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
@@ -196,6 +194,7 @@ static bool compute_command(mjxball_app *app, const pair_state *pair, const floa
     turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
 #endif
 #else
+    const float period = (float)mjxball_rig.period / 1000;
     float error[3], rate[3];
     leader_error(pair, goal, error, rate);
     pid(error, rate, app->integral, command);

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
 from mjxfly.lift import ALL, BRAKING, LiftWatch
 from mjxfly.limits import FlightSettings
-from mjxfly.policy_setup import command_maps, config_of
+from mjxfly.policy_setup import command_maps, config_of, load_follower
 from mjxfly.setpoints import CommandMap
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import ObjectState, Rig
@@ -29,10 +30,10 @@ G = 9.81
 
 
 def hovering(seconds: float = 20.0, height: float = HEIGHT, flown: float = 3.0) -> VirtualTwin:
-    """The pair of `flight`, `flown` seconds under both controllers."""
+    """The pair of `lqg`, `flown` seconds under both controllers."""
     pytest.importorskip("mujoco")
     settings = FlightSettings(seconds, (0.0, 0.0, height))
-    world = VirtualTwin(Policy.load(FLIGHT), settings, log=MemoryLog(False), settle=1.0)
+    world = VirtualTwin(load_follower(Path("lqg")), settings, log=MemoryLog(False), settle=1.0)
     world.fly_until(FlightState.FLY)
     world.fly_for(flown)
     return world
@@ -120,7 +121,7 @@ def test_a_hold_is_not_flown_by_what_was_measured_a_moment_ago() -> None:
     """One estimate stands still, the other one's clock does: motors were cut 9 cm above the ground."""
     pytest.importorskip("mujoco")
     settings, around = FlightSettings(3.0, (0.0, 0.0, 0.15)), Surroundings(seed=884, delay=0.03)
-    world = VirtualTwin(Policy.load(FLIGHT), settings, surroundings=around, log=MemoryLog(False), settle=0.3)
+    world = VirtualTwin(load_follower(Path("lqg")), settings, surroundings=around, log=MemoryLog(False), settle=0.3)
     world.fly_until(FlightState.FLY)
     world.fly_for(0.48)
     world.drones[0].inject(FAULT_KINDS["frozen"].what)
@@ -317,3 +318,14 @@ def test_flights_in_a_row_with_reboots_between_them() -> None:
         assert world.flight.supervisor.cause is None, number
         assert world.flight.lifted
         assert world.touchdown_speed() < 0.5
+
+
+@pytest.mark.slow
+def test_a_landing_that_begins_in_the_climb_does_not_tilt_the_pair() -> None:
+    """The goal jumped from 0.4 m to where the pair was: `lqg` tilted by 26 degrees and slid half a metre."""
+    world = hovering(1.0, flown=0.0)
+    world.run(60.0)
+    assert world.flight.supervisor.cause is None
+    flown = [moment for moment in world.track if moment.state in ("fly", "land")]
+    assert max(moment.tilt for moment in flown) < math.radians(5)
+    assert max(np.hypot(*moment.position[:2]) for moment in flown) < 0.1

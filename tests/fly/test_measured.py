@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,6 @@ from tables import rows, weekly
 
 from mjxball.control import rotations
 from mjxball.physics.step import start_state
-from mjxball.policy import Policy
-from mjxball.policy.file import shipped_policy
 from mjxfly import measured, probe
 from mjxfly.controller import FlightController
 from mjxfly.limits import FlightSettings
@@ -21,6 +20,7 @@ from mjxfly.measured import CONTRADICTING, REPEATING, WINDOW, DroneWatch, ImuWat
 from mjxfly.mocap_supervision import Frame as PoseFrame
 from mjxfly.mocap_supervision import Pose
 from mjxfly.packets import DroneState
+from mjxfly.policy_setup import load_follower
 from mjxfly.supervisor import Event, FlightState
 from mjxfly.telemetry import Sample
 from mjxfly.twin.conditions import Surroundings
@@ -200,7 +200,7 @@ def test_a_coarse_quaternion_keeps_its_turn() -> None:
 
 # Whole flights on the twin of a Crazyflie pair.
 
-FLIGHT = Policy.load(shipped_policy("flight"))
+FLIGHT = load_follower(Path("lqg"))
 HOVER = FlightSettings(seconds=30.0)
 
 
