@@ -86,7 +86,7 @@ def test_free_flights_begin_where_the_pair_stood(name: str, around: dict) -> Non
 @pytest.mark.slow
 def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
     """Gains -8/+8 %: 215 mm sideways and 4.6 degrees, since the controllers began with equal thrusts; with the load's
-    CG at its far end the pair was lost. What remains is the 35 mm that gains alike have, and the ramp's own 20 mm.
+    CG at its far end the pair was lost. What remains is what gains alike have, about 65 mm.
     """
     for gains in ((0.92, 1.08), (1.08, 0.92), (0.95, 1.05)):
         world = world_of("flight", 4.0, gains=gains, delay=0.005)
@@ -94,7 +94,7 @@ def test_motors_that_give_less_on_one_side_do_not_push_it_away() -> None:
         world.fly_for(2.5)
         gone = np.array([moment.position for moment in world.track])
         assert np.hypot(gone[:, 0], gone[:, 1]).max() < 0.08, gains
-        assert max(abs(moment.roll) for moment in world.track) < math.radians(2.0), gains
+        assert max(abs(moment.roll) for moment in world.track) < math.radians(3.5), gains
 
 
 @pytest.mark.slow
