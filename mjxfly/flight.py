@@ -353,7 +353,7 @@ class Flight:
         if entered is FlightState.LAND:
             if before.state is not FlightState.HOLD:
                 self._land_height = self._height(self._object())
-            if before.state is not FlightState.FLY:
+            if before.state not in (FlightState.FLY, FlightState.HOLD):  # a hold goes on where it was
                 self._goal_before = self._land_height
         if entered is FlightState.DESCEND:
             highest = max(filter(math.isfinite, self._heights), default=0.0)  # the newest height may be the fault

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from mjxball.baselines import CONTROLLERS
-from mjxball.config import Config, from_record
+from mjxball.config import Config
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError, said
 from mjxball.evaluate.followers import FollowerFactory, answered, follower_factory
 from mjxball.evaluate.policies import load_policy
 from mjxball.files import read_bytes
 from mjxball.policy import Policy, policy_name, policy_path, shipped_policies
+from mjxball.policy.file import adds_to_pid
 from mjxball.reading import parse_json
 
 BASELINES = Path(__file__).parents[1] / "baselines"
@@ -99,8 +100,8 @@ class OnnxFollower:
 
     def __init__(self, name: str, session: Any):
         self.name, self._session = name, session
-        if "config" in (metadata := _metadata(name, session)):
-            from_record(metadata["config"])
+        if adds_to_pid(_metadata(name, session)):
+            raise InputError(f"{name} adds to the leader's PID controller with its integrals, which none does now")
         self._remembers = "memory" in {one.name for one in session.get_inputs()}
         self._memory: np.ndarray | None = None
 

@@ -162,7 +162,7 @@ def _drones(value: Any) -> tuple[Drone, ...]:
     return tuple(from_dict(one, Drone, f"plant.drones.{number}", False) for number, one in enumerate(value))
 
 
-# Settings of earlier versions: false, or a gain that acted with the first alone.
+# Settings of earlier versions. `policy.file` refuses policies that were trained with them.
 RETIRED = (("follower", "residual_on_pid"), ("leader", "tilt_integral_gain"))
 
 
@@ -170,18 +170,14 @@ def from_record(data: Any) -> Any:
     """The configuration in the metadata of a policy file or in a flight log, not validated.
 
     Settings that the version which wrote it did not have get their defaults, which are what that version did. Raises
-    InputError for unknown names, without a plant, or for a residual on a PID controller (`RETIRED`).
+    InputError for other unknown names than `RETIRED`, or without a plant.
     """
     if isinstance(data, dict):
         if "plant" not in data:
             raise InputError("configuration does not fit this version: missing plant")
         data = dict(data)
         for part, name in RETIRED:
-            if isinstance(data.get(part), dict) and name in data[part]:
-                if data[part][name] is True:
-                    raise InputError(
-                        f"{part}.{name} is a setting of earlier versions of mjxball, which this one cannot fly"
-                    )
+            if isinstance(data.get(part), dict):
                 data[part] = {one: value for one, value in data[part].items() if one != name}
     return from_dict(data, complete=False)
 

@@ -104,6 +104,13 @@ def observing_stale(policy: PolicyFile) -> PolicyFile:
     )
 
 
+def adds_to_pid(metadata: dict[str, Any]) -> bool:
+    """Whether the network was trained on the leader's PID controller with its integrals, as in earlier versions."""
+    config = metadata.get("config")
+    follower = config.get("follower") if isinstance(config, dict) else None
+    return isinstance(follower, dict) and follower.get("residual_on_pid") is True
+
+
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     """Write `policy` to `path` atomically: a reader sees the old file or the complete new one."""
     check(policy, str(path))
@@ -281,7 +288,7 @@ def _metadata_faults(metadata: dict[str, Any]) -> Iterator[str]:
     config = metadata.get("config", {})
     if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
         yield "metadata field config is not a configuration"
-    if config.get("follower", {}).get("residual_on_pid") is True:
+    if adds_to_pid(metadata):
         yield "it adds to the leader's PID controller with its integrals, which this version no longer does"
     if type(metadata.get("stale", False)) is not bool:
         yield "metadata field stale must be true or false"

@@ -14,7 +14,7 @@ import pytest
 from conftest import Recurrent, Trained, policy_of, with_repeats, with_settings
 
 from mjxball.algorithms.gradient import FirstOrderGradient
-from mjxball.config import Config
+from mjxball.config import Config, from_record
 from mjxball.control import observation as layout
 from mjxball.env import TransportEnv
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
@@ -197,6 +197,20 @@ def test_a_policy_with_the_input_of_stale_commands_the_same_until_it_is_trained(
         for metadata, found in ((contents.metadata, added), (added.metadata, contents)):
             with pytest.raises(PolicyFileError, match="observation_mean must have shape"):
                 save_file(tmp_path / "other.npz", dataclasses.replace(found, metadata=metadata))
+
+
+def test_a_policy_that_shared_the_leaders_integrals_is_refused():
+    """Of earlier versions, whose logs and plants are read without those settings."""
+    contents = load_file(shipped_policy("flight"))
+    config = contents.metadata["config"]
+    earlier = {
+        **config,
+        "follower": {**config["follower"], "residual_on_pid": True},
+        "leader": {**config["leader"], "tilt_integral_gain": 10.0},
+    }
+    with pytest.raises(PolicyFileError, match="adds to the leader's PID controller with its integrals"):
+        check(dataclasses.replace(contents, metadata={**contents.metadata, "config": earlier}), "one")
+    assert from_record(earlier) == from_record(config)
 
 
 def test_a_policy_trained_with_stale_says_so(transport: Config):
