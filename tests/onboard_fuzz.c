@@ -74,10 +74,10 @@ static void check(const mjxball_setpoint *out, uint8_t before) {
     if ((app.phase == MJXBALL_FLY || app.phase == MJXBALL_LAND) && !within(app.command, 3, 1000))
         fail("a controller that commands no numbers flies on", out);
     if (rate.memory) return;
-    if (!within(app.command, 3, 100) || !within(app.integral, 7, 1e6f) || !within(app.velocity, 3, 200)
+    if (!within(app.command, 3, 100) || !within(app.integral, 3, 1e6f) || !within(app.velocity, 3, 200)
         || !within(app.position, 3, 2000) || !within(app.origin, 3, 2000) || !within(&app.trim, 1, 60000)
         || !within(&app.height, 1, 2000) || !within(&app.climb, 1, 200) || !within(app.set.mount, 3, 1)
-        || !within(app.set.goal, 3, 1000) || !within(app.peer.integral, 4, 1000) || !within(app.peer.velocity, 3, 50))
+        || !within(app.set.goal, 3, 1000) || !within(&app.peer.apart, 1, 1000) || !within(app.peer.velocity, 3, 50))
         fail("the app remembers what it must not", out);
 #if MJXBALL_MEMORY_SIZE > 0 && MJXBALL_FOLLOWER
     if (app.follower.running && !within(app.follower.memory, MJXBALL_MEMORY_SIZE, 3e38f))
@@ -87,12 +87,11 @@ static void check(const mjxball_setpoint *out, uint8_t before) {
 
 /* Inputs, in packets of which not a byte more may be read. */
 static void hear(void) {
-    float numbers[9];
+    float numbers[4]; /* velocity, half difference of the lifts */
     const int size = once_in(rate.beats) ? (int)below(MTU) : MJXBALL_BEAT_SIZE;
     uint8_t full[MTU] = {'M', !MJXBALL_FOLLOWER, app.phase, 1};
-    for (int k = 0; k < 9; k++) numbers[k] = noise(0.02f);
-    numbers[3] = noise(tilt_integral_limit());
-    wilden(numbers, 9, rate.beats);
+    for (int k = 0; k < 4; k++) numbers[k] = noise(0.02f);
+    wilden(numbers, 4, rate.beats);
     copy(full + 4, &mjxball_rig.key, 4);
     copy(full + 8, numbers, sizeof numbers);
     if (once_in(rate.beats)) full[2] = (uint8_t)below(9);
@@ -186,9 +185,9 @@ static void look_around(mjxball_state *state) {
 
 static void spoil(void) {
     float *const own[] = {app.origin, &app.land_height, app.position, app.velocity, app.integral, &app.trim, &app.climb,
-        &app.height, app.action, app.command, app.peer.integral, app.peer.velocity, &app.late, app.set.goal, app.set.mount,
+        &app.height, app.action, app.command, &app.peer.apart, app.peer.velocity, &app.late, app.set.goal, app.set.mount,
         &app.set.battery, &app.share, &app.apart, &app.resting, &app.low};
-    const uint32_t sizes[] = {3, 1, 3, 3, 7, 1, 1, 1, 3, 3, 4, 3, 1, 3, 3, 1, 1, 1, 1, 1};
+    const uint32_t sizes[] = {3, 1, 3, 3, 3, 1, 1, 1, 3, 3, 1, 3, 1, 3, 3, 1, 1, 1, 1, 1};
     for (uint32_t k = 0; k < sizeof sizes / sizeof *sizes; k++) wilden(own[k], sizes[k], rate.memory);
 #if MJXBALL_MEMORY_SIZE > 0 && MJXBALL_FOLLOWER
     wilden(app.follower.memory, MJXBALL_MEMORY_SIZE, 20 * rate.memory);

@@ -79,11 +79,6 @@ def flies(config): return Policy.load(POLICY)
 
 def controller(config): return Policy.load(POLICY).controller
 
-class Complete(Good):
-    def __init__(self, config): self.policy = Policy.load(POLICY)
-    def reset(self): self.policy.reset()
-    def __call__(self, observation): return self.policy(observation)
-
 class Loops(Good):
     def __call__(self, observation):
         while True: pass
@@ -305,7 +300,7 @@ def test_commands_are_clipped_as_everybodys(own: Path) -> None:
 
 
 def test_a_controller_has_one_score_in_every_form(own: Path) -> None:
-    """On Crazyflies, whose shared integrals are added to a residual alone: classes, baselines, by name."""
+    """Classes, baselines, by name."""
     first, *others = (values(flown(text, "crazyflie")) for text in ("copy", "own:Copies", "own:copies"))
     for other in others:
         np.testing.assert_array_equal(other, first)
@@ -335,20 +330,18 @@ def test_a_team_in_a_process_flies_as_in_a_simulation(own: Path) -> None:
 
 
 def test_a_policy_has_one_score_in_every_form(own: Path) -> None:
-    """A residual on the PID: as a file and by a class to the bit; a controller's float64 and ONNX round otherwise.
+    """As a file and by a class to the bit; a controller's float64 and ONNX round otherwise.
 
     Where a measurement is between two multiples of its resolution, rounding decides: 2 % of a time at limits.
     """
     pytest.importorskip("onnxruntime")
     assert export([str(FLIGHT), "flight.onnx"]) == 0
-    texts = (str(FLIGHT), "own:flies", "own:controller", "flight.onnx", "own:Complete")
-    file, by_class, controller, onnx, complete = (flown(text, "crazyflie") for text in texts)
+    texts = (str(FLIGHT), "own:flies", "own:controller", "flight.onnx")
+    file, by_class, controller, onnx = (flown(text, "crazyflie") for text in texts)
     np.testing.assert_array_equal(values(by_class), values(file))
     for other in (controller, onnx):
         np.testing.assert_allclose(values(other), values(file), rtol=0.02, atol=1e-6)
         assert [one.failures for one in other] == [one.failures for one in file]
-    # A class that does not say that its command is a residual answers complete commands.
-    assert np.abs(values(complete)[:, 0] / values(file)[:, 0] - 1).max() > 0.05
 
 
 def test_an_onnx_file_of_the_pairs_policy_comes_to_what_the_policy_does(own: Path) -> None:
