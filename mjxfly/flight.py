@@ -34,6 +34,18 @@ EASE = 0.8
 LIFTED = 0.05  # [m] height of O, or half of the goal's if that is less, from which the pair counts as airborne
 
 
+def landing_goal(elapsed: float, speed: float, start: float, before: float) -> tuple[float, float]:
+    """Height of a landing's goal [m] and its rate [m/s], `elapsed` [s] after landing began.
+
+    It sinks from `start`, where the pair was then, with a speed that grows evenly to `speed` within `EASE`. In that
+    time it also comes from `before`, the height of the goal until then.
+    """
+    eased, above = min(elapsed, EASE), before - start
+    share = eased / EASE
+    sunk, left = speed * (elapsed - eased + eased * share / 2), above * (1 - share) ** 2 * (1 + 2 * share)
+    return start - sunk + left, -speed * share - above * 6 * share * (1 - share) / EASE
+
+
 class Flight:
     """State and control loop of a flight. Call `begin`, then `tick` once per period until it returns false."""
 
@@ -265,16 +277,8 @@ class Flight:
         return np.array([0.0, 0.0, self._landing(self._now)[1]]) if self.supervisor.state is FlightState.LAND else None
 
     def _landing(self, now: float) -> tuple[float, float]:
-        """Height of a landing's goal [m] and its rate [m/s].
-
-        It sinks from where the pair was when landing began, with a speed that grows evenly within `EASE`. In that time
-        it also comes from the height of the goal before.
-        """
-        elapsed, speed = now - self.supervisor.since, self.settings.times.land_speed
-        eased, above = min(elapsed, EASE), self._goal_before - self._land_height
-        share = eased / EASE
-        sunk, left = speed * (elapsed - eased + eased * share / 2), above * (1 - share) ** 2 * (1 + 2 * share)
-        return self._land_height - sunk + left, -speed * share - above * 6 * share * (1 - share) / EASE
+        speed = self.settings.times.land_speed
+        return landing_goal(now - self.supervisor.since, speed, self._land_height, self._goal_before)
 
     @property
     def carry(self) -> str:

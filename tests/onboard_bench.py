@@ -32,9 +32,15 @@ def needs_gcc(test: Any) -> Any:
 
 
 def policy_of(name: str) -> PolicyFile:
-    """The shipped policy, or "recurrent flight"; for any rig with commands that a pair of Crazyflies can follow."""
+    """The shipped policy; for any rig with commands that a pair of Crazyflies can follow.
+
+    "recurrent flight" is not trained, and knows the rate of a goal.
+    """
     if name == "recurrent flight":
-        return onboard.recurrent()
+        policy = onboard.recurrent()
+        config = policy.metadata["config"]
+        scenario = {**config["scenario"], "goal_motion_probability": 0.5}
+        return dataclasses.replace(policy, metadata={**policy.metadata, "config": {**config, "scenario": scenario}})
     policy = load_file(shipped_policy(name))
     if name != "universal":
         return policy

@@ -184,10 +184,10 @@ static void look_around(mjxball_state *state) {
 }
 
 static void spoil(void) {
-    float *const own[] = {app.origin, &app.land_height, app.position, app.velocity, app.integral, &app.trim, &app.climb,
-        &app.height, app.action, app.command, &app.peer.apart, app.peer.velocity, &app.late, app.set.goal, app.set.mount,
+    float *const own[] = {app.origin, &app.land_height, &app.goal_before, app.position, app.velocity, app.integral, &app.trim,
+        &app.climb, &app.height, app.action, app.command, &app.peer.apart, app.peer.velocity, &app.late, app.set.goal, app.set.mount,
         &app.set.battery, &app.share, &app.apart, &app.resting, &app.low};
-    const uint32_t sizes[] = {3, 1, 3, 3, 3, 1, 1, 1, 3, 3, 1, 3, 1, 3, 3, 1, 1, 1, 1, 1};
+    const uint32_t sizes[] = {3, 1, 1, 3, 3, 3, 1, 1, 1, 3, 3, 1, 3, 1, 3, 3, 1, 1, 1, 1, 1};
     for (uint32_t k = 0; k < sizeof sizes / sizeof *sizes; k++) wilden(own[k], sizes[k], rate.memory);
 #if MJXBALL_MEMORY_SIZE > 0 && MJXBALL_FOLLOWER
     wilden(app.follower.memory, MJXBALL_MEMORY_SIZE, 20 * rate.memory);

@@ -118,7 +118,7 @@ static void arm_of(const pair_state *pair, const float *mount, float *arm, float
 }
 
 #if MJXBALL_FOLLOWER
-static void observe(const pair_state *pair, const float *goal, float *to) {
+static void observe(const pair_state *pair, const float *goal, float goal_rate, float *to) {
     float arm[3], sweep[3];
     arm_of(pair, mjxball_rig.mount[1], arm, sweep);
     for (int i = 0; i < 3; i++) {
@@ -129,6 +129,7 @@ static void observe(const pair_state *pair, const float *goal, float *to) {
         to[12 + i] = goal[i] - pair->position[i];
         to[15 + i] = -pair->velocity[i];
     }
+    to[17] += goal_rate;
 }
 
 #ifdef MJXBALL_MOUNT_ANGLE
@@ -157,7 +158,7 @@ static void command_of(const float *acceleration, float *command) {
 }
 
 #if !MJXBALL_FOLLOWER
-static void leader_error(const pair_state *pair, const float *goal, float *error, float *rate) {
+static void leader_error(const pair_state *pair, const float *goal, float goal_rate, float *error, float *rate) {
     float arm[3], sweep[3];
     arm_of(pair, mjxball_rig.mount[0], arm, sweep);
     for (int i = 0; i < 3; i++) {
@@ -168,6 +169,7 @@ static void leader_error(const pair_state *pair, const float *goal, float *error
             rate[i] -= sweep[i];
         }
     }
+    rate[2] += goal_rate;
 }
 
 static void pid(const float *error, const float *rate, const float *integral, float *command) {
@@ -178,13 +180,14 @@ static void pid(const float *error, const float *rate, const float *integral, fl
 }
 #endif
 
-/* One period of this drone's controller: sets `app->command`. False if the network's output is not finite. */
-static bool compute_command(mjxball_app *app, const pair_state *pair, const float *goal) {
+/* One period of this drone's controller: sets `app->command`. False if the network's output is not finite.
+   `goal_rate`: of the goal's height [m/s]. */
+static bool compute_command(mjxball_app *app, const pair_state *pair, const float *goal, float goal_rate) {
     float *command = app->command;
     bool good = true;
 #if MJXBALL_FOLLOWER
     float observation[18];
-    observe(pair, goal, observation);
+    observe(pair, goal, goal_rate, observation);
 #ifdef MJXBALL_MOUNT_ANGLE
     turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
 #endif
@@ -196,7 +199,7 @@ static bool compute_command(mjxball_app *app, const pair_state *pair, const floa
 #else
     const float period = (float)mjxball_rig.period / 1000;
     float error[3], rate[3];
-    leader_error(pair, goal, error, rate);
+    leader_error(pair, goal, goal_rate, error, rate);
     pid(error, rate, app->integral, command);
     for (int i = 0; i < 3; i++) {
         float ahead = error[i] + mjxball_rig.lead * rate[i];

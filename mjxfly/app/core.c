@@ -12,6 +12,7 @@
 #define PEER_AGE 300u
 #define RAMP_TIME 1500u
 #define LAND_SPEED 0.25f      /* [m/s] */
+#define EASE 0.8f             /* [s] in which a landing's goal leaves its former height */
 #define SINK_SPEED 0.4f
 #define BLIND_SPEED 0.5f
 #define DESCEND_TIME 4000u    /* [ms] */
@@ -103,7 +104,8 @@ static float found_apart(const mjxball_app *app) {
 }
 
 static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_map *map) {
-    float height = app->position[2] - app->origin[2];
+    const float height = app->position[2] - app->origin[2];
+    const uint8_t before = app->phase;
     app->phase = phase;
     app->cause = cause;
     app->since = app->now;
@@ -123,6 +125,7 @@ static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_
 #endif
     } else if (phase == MJXBALL_LAND) {
         app->land_height = height;
+        app->goal_before = before == MJXBALL_FLY ? app->set.goal[2] : height;
     } else if (phase == MJXBALL_DESCEND) {
         app->height = height;
         app->climb = app->velocity[2];
@@ -164,7 +167,7 @@ static void check_flight(const mjxball_app *app, const pair_state *pair, const m
     request *to) {
     const bool guided = app->phase == MJXBALL_FLY || app->phase == MJXBALL_LAND;
     const uint32_t elapsed = app->now - app->since;
-    float place[3], landing = (app->land_height + 0.3f) / LAND_SPEED + mjxball_rig.land_spare;
+    float place[3], landing = EASE + (app->land_height + 0.3f) / LAND_SPEED + mjxball_rig.land_spare;
     for (int i = 0; i < 3; i++) place[i] = state->position[i] - app->origin[i];
     if (!laptop_is_heard(app)) ask(to, MJXBALL_LAND, MJXBALL_NO_LAPTOP);
     if (!peer_is_heard(app)) ask(to, MJXBALL_LAND, MJXBALL_NO_PEER);
@@ -293,16 +296,22 @@ static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint 
     descend(app, false, out);
 }
 
+/* Height of a landing's goal above the origin [m], and its rate [m/s]: as in mjxfly/flight.py. */
+static float landing_goal(const mjxball_app *app, float *rate) {
+    const float elapsed = (float)(app->now - app->since) / 1000, eased = clip(elapsed, 0, EASE), share = eased / EASE;
+    const float above = app->goal_before - app->land_height, sunk = LAND_SPEED * (elapsed - eased + eased * share / 2);
+    *rate = -LAND_SPEED * share - above * 6 * share * (1 - share) / EASE;
+    return clip(app->land_height - sunk + above * (1 - share) * (1 - share) * (1 + 2 * share), -1, 10);
+}
+
 static void fly(mjxball_app *app, const pair_state *pair, const mjxball_map *map, mjxball_setpoint *out) {
     const float period = (float)mjxball_rig.period / 1000, hover = hover_of(app, map);
-    float goal[3];
+    float goal[3], goal_rate = 0;
     for (int i = 0; i < 3; i++) goal[i] = app->origin[i] + app->set.goal[i];
     if (mjxball_rig.stand) goal[0] = goal[1] = 0;
-    if (app->phase == MJXBALL_LAND) {
-        float sunk = LAND_SPEED * (float)(app->now - app->since) / 1000;
-        goal[2] = app->origin[2] + clip(app->land_height - sunk, -1, 10);
-    }
-    if (!compute_command(app, pair, goal) || app->late > 10) {
+    if (app->phase == MJXBALL_LAND) goal[2] = app->origin[2] + landing_goal(app, &goal_rate);
+    if (!mjxball_rig.knows_rates) goal_rate = 0;
+    if (!compute_command(app, pair, goal, goal_rate) || app->late > 10) {
         app->copying = 1;
         if (app->phase == MJXBALL_FLY) enter(app, MJXBALL_LAND, app->late > 10 ? MJXBALL_LATE : MJXBALL_BAD_COMMAND, map);
     }

@@ -76,6 +76,7 @@ typedef struct {
     float kp[3], kd[3], ki[3], band[3], lead; /* the leader's controller, see sim/controllers.py */
     int stand;             /* only height and roll are free */
     int own_error;         /* the leader's error is that of its mount, not of O */
+    int knows_rates;       /* the follower was trained with goals that move */
     int paper;             /* 1: thrust by the paper's map, 0: by the force curve */
     float goal[3];         /* from the start [m] */
     float fence_low[3], fence_high[3];
@@ -126,7 +127,7 @@ typedef struct {
     uint32_t since, now, laptop_time, peer_time, saturated_since, charged;
     float late;       /* number of late ticks, with exponential decay within about a second */
     mjxball_parameters set; /* in use */
-    float origin[3], land_height;
+    float origin[3], land_height, goal_before; /* heights above the origin where a landing began, and of its goal then */
     float position[3], velocity[3]; /* of O */
     float integral[3]; /* of the leader's error [m s] */
     float trim;       /* hover thrust [thrust units] */

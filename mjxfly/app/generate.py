@@ -111,6 +111,7 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "lead": leader.integral_lead_time,
         "stand": int(stand),
         "own_error": int(leader.error != "object"),
+        "knows_rates": int(config.scenario.goal_motion_probability > 0),
         "paper": int(config.autopilot.thrust_law == "paper"),
         "goal": goal,
         "fence_low": bounds.fence_low,

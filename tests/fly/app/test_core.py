@@ -17,13 +17,14 @@ from mjxfly.app import generate, protocol
 from mjxfly.app.host import App
 from mjxfly.app.protocol import CAUSES, AppPhase
 from mjxfly.controller import FlightController
+from mjxfly.flight import landing_goal
 from mjxfly.telemetry import ObjectState, Rig
 
 
 @needs_gcc
 @pytest.mark.parametrize("name", ["flight", "stand", "recurrent flight", "universal"])
 def test_the_apps_command_what_the_laptop_would(name: str):
-    """Leader and follower over 5 s of motion: float32 on board, float64 controllers on the laptop."""
+    """Leader and follower over 5 s of motion, then a landing: float32 on board, float64 controllers on the laptop."""
     policy = policy_of(name)
     bench = Bench(cores_of(name), Rig.from_metadata(policy.metadata))
     controller = FlightController(Policy(policy, name))
@@ -34,22 +35,31 @@ def test_the_apps_command_what_the_laptop_would(name: str):
     bench.take_off()  # the last period was one of the controllers', at rest
     controller.step(AT_REST, goal)
     worst, spread = np.zeros(6), np.zeros(6)
-    for number in range(500):  # noqa: B007
+    begin, periods = 0.0, {AppPhase.FLY: 0, AppPhase.LAND: 0}
+    for number in range(600):
         velocity = 0.95 * velocity + random.normal(scale=0.01, size=3)
         position, rates = 0.99 * position + 0.01 * velocity, 0.9 * rates + random.normal(scale=0.02, size=3)
         euler = 0.97 * euler + 0.01 * rates
-        moving = [np.array(one) for one in (position, velocity, euler, rates)]
+        moving = [position + 0.75 * goal, *(np.array(one) for one in (velocity, euler, rates))]
         if not free:
             moving[0][:2] = moving[1][:2] = moving[2][1:] = moving[3][1:] = 0.0
         pair = ObjectState(moving[0], moving[1], rotations.quaternion_from_euler(moving[2]), moving[3])
-        bench.tick(AppPhase.FLY, pair)
-        wanted = controller.step(pair, goal)
+        phase = AppPhase.FLY if number < 500 else AppPhase.LAND
+        if number == 500:
+            begin = float(moving[0][2])
+        height, sinks = (
+            (goal[2], 0.0) if number < 500 else landing_goal((number - 500) * controller.period, 0.25, begin, goal[2])
+        )
+        bench.tick(phase, pair)
+        wanted = controller.step(pair, np.array([0.0, 0.0, height]), np.array([0.0, 0.0, sinks]))
         both = np.concatenate([wanted.leader, wanted.follower])
         found = np.concatenate([app.command for app in bench.apps])
-        if bench.phases != [AppPhase.FLY] * 2:
+        if bench.phases != [phase] * 2:
             break
+        periods[phase] += 1
         worst, spread = np.maximum(worst, abs(found - both)), np.maximum(spread, abs(both))
-    assert number > 50
+    assert periods[AppPhase.FLY] > 50
+    assert periods[AppPhase.LAND] >= (100 if free else 30)  # one on the stand is down then
     # Float rounding, fed back through the follower's memory; m/s2 beside rad.
     assert worst.max() < 1e-4
     assert spread[5] > 0.05
