@@ -28,8 +28,8 @@ FIRST = {  # what README trains
         "`python train.py` trains a follower for a pair in {seconds} s on two cores: {shares} % (medians)."
     ),
     RESULTS / "first_command_sac.json": (
-        "The paper's SAC on MJX, with exact sensors "
-        "([`--algorithm sac`](docs/training.md#algorithms)): {shares} % after {seconds} s."
+        "The paper's algorithm, SAC on MJX (our reward, exact sensors; "
+        "[`--algorithm sac`](docs/training.md#algorithms)): {shares} % after {seconds} s."
     ),
 }
 

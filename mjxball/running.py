@@ -19,9 +19,18 @@ EXTRAS = {"onnx": "onnx", "gymnasium": "gym"}
 EXTRAS |= dict.fromkeys(("cflib", "yaml", "mcap", "mcap_ros2", "rosbags", "pyarrow", "websockets"), "fly")
 
 
+before_quitting: list[Callable[[], None]] = []  # what an exit that skips `finally` has to call
+
+
 def quit_on_interrupt() -> None:
     """Make Ctrl-C end the process at once, without output, code 130; an interrupted import can abort Python."""
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
+    def quit_now(*_: object) -> None:
+        for one in before_quitting:
+            one()
+        os._exit(130)
+
+    signal.signal(signal.SIGINT, quit_now)
 
 
 def collect_seldom() -> None:

@@ -54,7 +54,7 @@ class Event(Enum):
     TILT = "a drone tilts beyond the limit"
     STICK = "the two positions contradict the stick: its length or its tilt"
     ESTIMATOR = "an estimator's position cannot be trusted"
-    FRAME = "what is measured of a drone moves otherwise than its IMU feels"
+    FRAME = "a drone's measured motion contradicts its IMU"
     BATTERY = "a battery is low"
     LIFT = "a battery will not carry its drone to the end of a landing"
     SATURATED = "thrust has been at its bound for too long"

@@ -285,5 +285,9 @@ def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any)
     try:
         return jax.eval_shape(function, *arguments)
     except FOREIGN as error:
-        mend = "it must be made of JAX operations" if isinstance(error, jax.errors.JAXTypeError) else "mend it"
+        mend = (
+            "use JAX operations, such as `jnp.where` for `if`"
+            if isinstance(error, jax.errors.JAXTypeError)
+            else "mend it"
+        )
         raise InputError(f"{flag}: {what} raised {said(error)}; {mend}") from None

@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 
 from mjxball.errors import InputError
 from mjxball.reading import parse_json
+from mjxball.running import before_quitting
 
 LOCK = ".lock"  # in the run directory
 _held = set[Path]()  # lock files of this process
@@ -34,14 +35,20 @@ def held(run: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"run directory {run} cannot be written: {error.strerror or error}") from None
     _held.add(run / LOCK)
-    try:
-        yield
-    finally:
+
+    def leave() -> None:
         drop()  # before the release, so that a process waiting for the lock notices that the file is gone
-        lock.release()
         with contextlib.suppress(OSError):
             for place in created:  # removes empty directories only
                 place.rmdir()
+
+    before_quitting.append(leave)
+    try:
+        yield
+    finally:
+        before_quitting.remove(leave)
+        leave()
+        lock.release()
 
 
 def check_free(run: Path) -> None:

@@ -188,7 +188,7 @@ def test_an_import_of_brax_says_nothing_of_warp(tmp_path: Path) -> None:
         ("--env", "toys:Sizeless", "observation_size raised ValueError: no ruler"),
         ("--env", "toys:Masked", "input_mask must hold observation_size = 2 numbers"),
         ("--env", "toys:Bare", "whose info is a dictionary"),
-        ("--env", "toys:Branching", "made of JAX operations"),
+        ("--env", "toys:Branching", "in toys.py line 96; use JAX operations"),
         ("--reward", "toys:NUMBER", "--reward toys:NUMBER is no function"),
         ("--reward", "toys:vector", "one number"),
         ("--reward", "toys:binary", "(state, action, next state)"),

@@ -22,7 +22,9 @@ from train.test_distributed import SMALL, finish, launch
 HOLD = """
 import sys
 from pathlib import Path
+from mjxball.running import quit_on_interrupt
 from mjxball.train.lock import held
+quit_on_interrupt()
 with held(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
@@ -60,6 +62,12 @@ def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder
     done = command([script("train.py"), *tiny(out=run)], tmp_path)
     assert done.returncode == 2
     assert f"process {holder.pid}" in done.stderr
+
+
+def test_ctrl_c_before_a_training_has_begun_leaves_no_lock(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
+    holder.send_signal(signal.SIGINT)
+    assert holder.wait(timeout=60) == 130
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
