@@ -71,7 +71,8 @@ def test_every_row_is_told_and_a_failing_tracker_ends_nothing(here: Path, capsys
     my_tracker.told.clear()
     assert main([*SHORT[:-1], "second", "--tracker", "my_tracker:failing"]) == 0
     assert len(my_tracker.told) == 1
-    assert "--tracker raised OSError: no network, in my_tracker.py line 11; it gets no more rows" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "--tracker raised OSError: no network, in my_tracker.py line 11; it gets no more rows" in told
     assert (here / "second/policy.npz").exists()
 
 
