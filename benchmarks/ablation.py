@@ -35,7 +35,7 @@ PARTS: dict[str, Callable[[Scenario], Scenario]] = {
     "all of these": lambda one: disturbed(
         one, noise=0.0, estimator_drift=0.0, offset=0.0, gap_rate=0.0, jitter=0.0, delay=0.0, pose_lag=0.0
     ),
-    "other attitude loops": lambda one: replace(one, loop_scale=1.0),
+    "off-nominal attitude loops": lambda one: replace(one, loop_scale=1.0),
     "other thrusts": lambda one: replace(one, thrust=(), thrust_fade=0.0),
     "air": lambda one: replace(disturbed(one, gust=0.0), **NO_AIR),
 }

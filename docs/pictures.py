@@ -216,25 +216,34 @@ def supervisor(out: Path) -> None:
     (out / "supervisor.svg").write_text(state_chart())
 
 
-def learning_curves(out: Path) -> None:
-    """Page results: cost of an episode against seconds, from learning_curves_h200.json."""
-    found = json.loads((RESULTS / "learning_curves_h200.json").read_text())
-    labels = {"sac": "SAC", "ppo": "PPO", "gradient": "first-order gradients", "stock": "Brax's own SAC"}
-    figure, axis = pyplot().subplots(figsize=(7, 4), layout="constrained")
-    looks = series_styles([*labels])
-    for name, rows in found["curves"].items():
-        seconds, cost = np.array([(row["seconds"], -row["return"]) for row in rows]).T
-        axis.plot(seconds, cost, **line(looks[name]), label=labels[name])
-        at = np.array([row["at_bar"] for row in rows])
-        axis.plot(seconds[at], cost[at], "o", color=looks[name]["color"], markersize=5, clip_on=False)
-    axis.plot([], [], "o", color=INK, markersize=5, label="at the bar")
-    axis.set(xscale="log", xlabel="seconds since process start", ylabel="cost of an episode (minus its return)")
-    axis.set_xticks([5, 10, 20, 30, 50], ["5", "10", "20", "30", "50"], minor=False)
-    axis.set_xticks([], minor=True)
-    logarithmic(axis)
-    axis.grid()
-    legend_above(figure, [axis], 3, found["versions"]["where"])
-    save(figure, out / "learning-curves.svg")
+CURVES = {  # label: results of benchmarks/first_command.py
+    "gradients, two cores": "first_command",
+    "SAC on MJX, two cores": "first_command_sac",
+    "Brax's SAC, two cores": "first_command_brax",
+    "gradients (`balance`), one H200": "first_command_h200",
+    "SAC (`balance`), one H200": "first_command_sac_h200",
+}
+
+
+def success_curves(out: Path) -> None:
+    """Page results: success against seconds since the command began, beside the best classical follower."""
+    figure, panels = pyplot().subplots(1, 2, figsize=(8, 4), sharey=True, layout="constrained")
+    looks = series_styles([*CURVES, "best classical"])
+    for panel, condition in zip(panels, CONDITIONS, strict=True):
+        for label, name in CURVES.items():
+            if not (RESULTS / f"{name}.json").exists():
+                continue
+            for row in json.loads((RESULTS / f"{name}.json").read_text())["rows"]:
+                if row["cache"] == "empty":
+                    points = [(one["seconds"], 100 * one[condition]) for one in row["curve"]]
+                    panel.plot(*zip(*points, strict=True), **looks[label] | {"markersize": 3}, label=label)
+        share, _ = leaderboard.best(KINDS["classical"], "pair", condition)
+        panel.axhline(share, **line(looks["best classical"]), label="best classical")
+        panel.set(xlabel="seconds since the command began", title=condition, ylim=(-3, 100))
+        panel.grid()
+    panels[0].set_ylabel("success, track pair [%]")
+    legend_above(figure, panels, 3)
+    save(figure, out / "success-curves.svg")
 
 
 def best(out: Path) -> None:
@@ -431,7 +440,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "crazyflie-stand": crazyflie_stand,
     "crazyflie-gains": crazyflie_gains,
     "supervisor": supervisor,
-    "learning-curves": learning_curves,
+    "success-curves": success_curves,
     "frames": frames,
     "own-rig": own_rig,
     "viewer": viewer,
@@ -442,7 +451,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
 MADE = (
     *(
         f"{name}.svg"
-        for name in ("best", "cancels", "copying", "flight", "crazyflie-stand", "crazyflie-gains", "learning-curves")
+        for name in ("best", "cancels", "copying", "flight", "crazyflie-stand", "crazyflie-gains", "success-curves")
     ),
     "supervisor.svg",
     "frames.svg",

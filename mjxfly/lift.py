@@ -21,7 +21,8 @@ from mjxfly.telemetry import ObjectState, Rig
 RESERVE = 0.15  # [V] above the voltage at which full power carries the weight; full power lowers it by as much
 SAMPLES = 5  # ticks, over which the median voltage is taken
 WINDOW = 0.5  # [s] over which the rate of the voltage is measured
-SCARCE = 1.05  # lift over weight below which a drone gets full thrust in a descent
+SCARCE = 1.05  # lift over weight below which a drone is weak
+SPARE = 0.03  # lift over weight that a weak drone keeps to control its attitude, or it gets full thrust
 ALL = 1.2  # full thrust in a descent, over hover thrust
 LEVELLING = (2.5, 1.0)  # thrust over hover taken from the higher end of the stick, per m and per m/s
 BRAKING = 0.25  # the same from the end that lags in a motion along the stick, per m/s
@@ -73,10 +74,10 @@ class LiftWatch:
     def shared(self, wanted: float, seen: ObjectState | None, rig: Rig) -> list[float]:
         """Thrust over hover thrust of leader and follower in a descent; `wanted` for both if there is lift enough.
 
-        A drone that lacks lift gets full thrust, since it would fall faster with less. The other one lifts no more than
-        the weak one, or the stick would turn over. The weak drone's thrust lags and also controls its attitude, so the
-        higher end of the stick, by the object's state `seen`, gets less. A pair that climbs has lift enough for the
-        rest of the flight, whatever the voltage.
+        A drone that cannot lift its share of `wanted` gets full thrust. The other one lifts no more than the weak one,
+        or the stick would turn over. The weak drone's thrust lags and also controls its attitude, so the higher end of
+        the stick, by the object's state `seen`, gets less. A pair that climbs has lift enough for the rest of the
+        flight, whatever the voltage.
         """
         self._disproved = self._disproved or (seen is not None and float(seen.velocity[2]) > CLIMBS)
         if self.share > SCARCE or self._disproved:
@@ -88,5 +89,5 @@ class LiftWatch:
             stick = seen.matrix[:2] @ rig.span
             along = float(seen.velocity[:2] @ stick) / max(float(np.linalg.norm(stick)), 1e-6)
         excess = LEVELLING[0] * up + LEVELLING[1] * rising - BRAKING * along
-        most = [ALL if share < SCARCE else self.share for share in self.shares]
+        most = [min(wanted, self.share) if share > wanted + SPARE else ALL for share in self.shares]
         return [most[0] - max(excess, 0.0), most[1] - max(-excess, 0.0)]

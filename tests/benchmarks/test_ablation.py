@@ -29,7 +29,7 @@ def test_every_part_is_left_out_and_nothing_else() -> None:
         for name, part in ablation.PARTS.items()
     }
     assert changed.pop("nothing") == set()
-    assert changed.pop("other attitude loops") == {"loop_scale"}
+    assert changed.pop("off-nominal attitude loops") == {"loop_scale"}
     assert changed.pop("other thrusts") == {"thrust", "thrust_fade"}
     assert changed.pop("air") == {"disturbance", *ablation.NO_AIR}
     assert set(map(frozenset, changed.values())) == {frozenset({"disturbance"})}
