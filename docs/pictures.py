@@ -53,7 +53,6 @@ from mjxball.plotting import (
     follower_styles,
     legend_above,
     line,
-    logarithmic,
     pyplot,
     rendered,
     save,
