@@ -178,8 +178,8 @@ class Algorithm(Protocol):
 
     Optional attributes: `prefers_cpu`, true or a function of configuration and number of members, if training on a CPU
     is faster, or no GPU program can be; `large_products = True` if its matrix products are large enough for a GPU's
-    cuBLAS; `averaged`, names of the fields of its state that are means over environments after `collect`, so that these
-    can be cut over the devices of a CPU (`Shards`).
+    cuBLAS; `long_loops = True` if it loops over many small operations; `averaged`, names of the fields of its state
+    that are means over environments after `collect`, so that these can be cut over the devices of a CPU (`Shards`).
     """
 
     schedule: Schedule

@@ -85,6 +85,7 @@ class FirstOrderGradient:
     metrics = ("loss", "gradient_norm")
     engines = ("newton-euler",)  # MJX's solver iterates in a loop, which has no reverse-mode gradient
     averaged = ("slope", "loss", "mean", "square")  # of the state after `collect`, over parts that are not joined
+    long_loops = True
     collect_keys = 1
     update_keys = 0
 

@@ -33,6 +33,11 @@ if jax.__version_info__ < (0, 11):
     CPU_OPTIONS["xla_cpu_use_fusion_emitters"] = False
 # For one follower with layers of 64, plain loops are fast enough, and avoid 2 - 5 s for a Triton kernel per product.
 PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # elements of both matrices
+# A window of gradients is a loop of many small kernels, which waits for their launches unless it is one CUDA graph.
+GRAPHS: dict[str, Any] = {
+    "xla_gpu_graph_min_graph_size": 1,
+    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,WHILE,CONDITIONAL,CUSTOM_CALL,DYNAMIC_SLICE_FUSION",
+}
 
 
 def compiler_options(algorithm: Any = None, members: int = 1) -> dict[str, Any] | None:
@@ -42,11 +47,12 @@ def compiler_options(algorithm: Any = None, members: int = 1) -> dict[str, Any] 
     the class of the algorithm if it is not SAC.
     """
     if jax.default_backend() == "gpu":
+        graphs = GRAPHS if getattr(algorithm, "long_loops", False) else {}
         if members > 1:
-            return TUNED_GPU_OPTIONS
+            return TUNED_GPU_OPTIONS | graphs
         if getattr(algorithm, "large_products", False):
-            return CUBLAS_GPU_OPTIONS
-        return GPU_OPTIONS | PLAIN_PRODUCTS
+            return CUBLAS_GPU_OPTIONS | graphs
+        return GPU_OPTIONS | PLAIN_PRODUCTS | graphs
     return CPU_OPTIONS if getattr(algorithm, "prefers_cpu", False) else None
 
 

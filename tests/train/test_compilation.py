@@ -72,6 +72,15 @@ def test_many_followers_products_are_tuned_on_a_gpu(monkeypatch: pytest.MonkeyPa
     assert not large["xla_gpu_enable_triton_gemm"]  # hundreds of kernels to compile and try
 
 
+def test_xla_takes_the_options_of_every_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    lowered = jax.jit(jnp.sin).lower(1.0)
+    for device, algorithm in ((one, kind) for one in ("cpu", "gpu") for kind in (None, FirstOrderGradient)):
+        monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
+        options = compiler_options(algorithm)
+        assert ("xla_gpu_graph_min_graph_size" in (options or {})) is (device == "gpu" and algorithm is not None)
+        assert lowered.compile(compiler_options=options)(1.0) == pytest.approx(np.sin(1.0))
+
+
 class Measured:
     """An environment that measures its observation by a reset, as Brax's do."""
 
