@@ -216,11 +216,9 @@ def supervisor(out: Path) -> None:
 
 
 CURVES = {  # label: results of benchmarks/first_command.py
-    "gradients, two cores": "first_command",
-    "SAC on MJX, two cores": "first_command_sac",
-    "Brax's SAC, two cores": "first_command_brax",
-    "gradients (`balance`), one H200": "first_command_h200",
-    "SAC (`balance`), one H200": "first_command_sac_h200",
+    "gradients (quick), two cores": "success_curve_gradient",
+    "SAC on MJX (transport), two cores": "success_curve_sac",
+    "Brax's SAC (transport), two cores": "success_curve_brax",
 }
 
 
@@ -230,12 +228,9 @@ def success_curves(out: Path) -> None:
     looks = series_styles([*CURVES, "best classical"])
     for panel, condition in zip(panels, CONDITIONS, strict=True):
         for label, name in CURVES.items():
-            if not (RESULTS / f"{name}.json").exists():
-                continue
-            for row in json.loads((RESULTS / f"{name}.json").read_text())["rows"]:
-                if row["cache"] == "empty":
-                    points = [(one["seconds"], 100 * one[condition]) for one in row["curve"]]
-                    panel.plot(*zip(*points, strict=True), **looks[label] | {"markersize": 3}, label=label)
+            (row,) = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+            points = [(one["seconds"], 100 * one[condition]) for one in row["curve"]]
+            panel.plot(*zip(*points, strict=True), **looks[label] | {"markersize": 4}, label=label)
         share, _ = leaderboard.best(KINDS["classical"], "pair", condition)
         panel.axhline(share, **line(looks["best classical"]), label="best classical")
         panel.set(xlabel="seconds since the command began", title=condition, ylim=(-3, 100))
