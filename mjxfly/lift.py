@@ -89,5 +89,6 @@ class LiftWatch:
             stick = seen.matrix[:2] @ rig.span
             along = float(seen.velocity[:2] @ stick) / max(float(np.linalg.norm(stick)), 1e-6)
         excess = LEVELLING[0] * up + LEVELLING[1] * rising - BRAKING * along
-        most = [min(wanted, self.share) if share > wanted + SPARE else ALL for share in self.shares]
+        weak = min(SCARCE, wanted + SPARE)
+        most = [ALL if share < weak else min(wanted, self.share) for share in self.shares]
         return [most[0] - max(excess, 0.0), most[1] - max(-excess, 0.0)]

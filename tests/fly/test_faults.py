@@ -277,6 +277,22 @@ def test_without_lift_the_stick_leans_against_its_motion() -> None:
         assert watch.shared(0.98, seen._replace(velocity=across), rig) == pytest.approx([ALL, ALL])
 
 
+@pytest.mark.parametrize(
+    ("shares", "wanted", "given"),
+    [
+        ((1.03, 1.5), 0.9, [0.9, 0.9]),  # it can give that
+        ((1.03, 1.5), 1.02, [ALL, 1.02]),
+        ((1.03, 1.5), 1.1, [ALL, 1.03]),
+        ((0.85, 1.08), 1.1, [ALL, 0.85]),  # no more than the weak one, or the stick turns over
+        ((0.85, 0.9), 1.1, [ALL, ALL]),
+    ],
+)
+def test_a_weak_drone_gets_full_thrust_where_it_cannot_give_what_is_wanted(shares, wanted: float, given: list) -> None:
+    watch = LiftWatch(MOTORS["2.1"])
+    watch.shares = list(shares)
+    assert watch.shared(wanted, None, Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))) == given
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("drone", [0, 1])
 def test_a_battery_that_gives_way_leaves_the_pair_where_it_is(drone: int) -> None:
